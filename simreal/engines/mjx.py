@@ -1,0 +1,127 @@
+"""MuJoCo's dynamics in JAX: accelerators and gradients."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from simreal.actuators import limit_control
+from simreal.engines.base import Data, Engine, Inputs, Physics, refuse_reverse_gradient
+from simreal.errors import UserError
+from simreal.quiet import import_mjx
+from simreal.world import World
+
+mjx = import_mjx()
+
+_LIFTED = 1e-12
+"""Stands in for a nominal zero that varies, so that MJX does not compile its effect away."""
+
+
+class MjxEngine(Engine):
+    """MJX, with the World's fields replaced in the model."""
+
+    name = "mjx"
+
+    def __init__(self, *args: Any, varies_period: bool = False, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        if np.any(self.model.actuator_delay > 0):
+            names = [self.model.actuator(i).name for i in np.flatnonzero(self.model.actuator_delay > 0)]
+            raise UserError(
+                f"the model gives actuator {names[0]!r} a delay, which mjx ignores; remove it from the MJCF and "
+                f"use the factor actuator.delay({names[0]!r}), or engine='mujoco'"
+            )
+        model = mujoco.MjModel.__copy__(self.model)
+        if "dof_frictionloss" in self.varied:
+            model.dof_frictionloss[:] = np.maximum(model.dof_frictionloss, _LIFTED)
+        # "Same frame" is a shortcut that MJX takes while compiling; where a centre of mass varies there is none.
+        for name in ("body_sameframe", "geom_sameframe"):
+            if name in self.varied:
+                getattr(model, name)[:] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
+        self._mjx_model = jax.tree.map(jnp.asarray, mjx.put_model(model, impl="jax"))
+        self._mjx_data = jax.tree.map(jnp.asarray, mjx.make_data(model, impl="jax"))
+        self._known = tuple(
+            n for n in self.varied if _has(self._mjx_model, n) and not n.endswith("sameframe")
+        )
+        self._guard = self.model.opt.iterations > 1
+
+    def _load(self, world: World, physics: Physics) -> tuple[Any, Any]:
+        model = self._mjx_model.tree_replace({name: world.model[name] for name in self._known})
+        qpos = refuse_reverse_gradient(physics.qpos) if self._guard else physics.qpos
+        data = self._mjx_data.replace(
+            time=physics.time,
+            qpos=qpos,
+            qvel=physics.qvel,
+            act=physics.act,
+            qacc_warmstart=physics.qacc_warmstart,
+        )
+        return model, data
+
+    def forward(self, world: World, physics: Physics) -> Data:
+        model, data = self._load(world, physics)
+        return self._read(self._current(model, data), physics)
+
+    def step(self, world: World, physics: Physics, inputs: Inputs) -> tuple[Physics, Data]:
+        model, data = self._load(world, physics)
+        if inputs.period_scale is not None:
+            model = model.tree_replace({"opt.timestep": model.opt.timestep * inputs.period_scale})
+        if inputs.push is not None:
+            force = jnp.where(np.arange(6) < 3, jnp.pad(inputs.push, (0, 3)), 0)
+            on_body = (np.arange(self.model.nbody) == self.push_body)[:, None]
+            data = data.replace(xfrc_applied=jnp.where(on_body, force, data.xfrc_applied))
+        controls = jnp.broadcast_to(inputs.controls, (self.substeps, self.model.nu))
+
+        def substep(data: Any, control: jax.Array) -> tuple[Any, None]:
+            if inputs.limits:
+                velocity = data.qvel[self._dofadr] * self._gear
+                length = data.qpos[self._qposadr] * self._gear
+                gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
+                control = limit_control(jnp, control, velocity, length, gain, bias, inputs.limits)
+            return mjx.step(model, data.replace(ctrl=control)), None
+
+        data, _ = jax.lax.scan(substep, data, controls)
+        moved = Physics(data.time, data.qpos, data.qvel, data.act, data.qacc_warmstart)
+        return moved, self._read(self._current(model, data), moved)
+
+    def _current(self, model: Any, data: Any) -> Any:
+        """Derived fields at the new state, as mj_step1 makes them, without collision and dynamics."""
+        from mujoco.mjx._src import sensor, smooth
+
+        data = smooth.kinematics(model, data)
+        data = smooth.com_pos(model, data)
+        data = smooth.camlight(model, data)
+        data = smooth.tendon(model, data)
+        data = smooth.transmission(model, data)
+        velocity = data._impl.actuator_moment @ data.qvel
+        data = data.tree_replace({"_impl.actuator_velocity": velocity})
+        data = smooth.com_vel(model, data)
+        if "sensordata" in self.data_fields:
+            data = sensor.sensor_vel(model, sensor.sensor_pos(model, data))
+        return data
+
+    def _read(self, data: Any, physics: Physics) -> Data:
+        return Data(
+            time=physics.time,
+            qpos=physics.qpos,
+            qvel=physics.qvel,
+            actuator_force=data.actuator_force,
+            actuator_velocity=data._impl.actuator_velocity,
+            fields={name: _get(data, name).reshape(self._shape(name)) for name in self.data_fields},
+        )
+
+    def _shape(self, name: str) -> tuple[int, ...]:
+        # mujoco.batch keeps matrices flat, (nsite, 9); so do we on both engines.
+        value = _get(self._mjx_data, name)
+        return (value.shape[0], 9) if value.ndim == 3 and value.shape[1:] == (3, 3) else value.shape
+
+
+def _get(data: Any, name: str) -> jax.Array:
+    return getattr(data, name) if hasattr(data, name) else getattr(data._impl, name)
+
+
+def _has(model: Any, name: str) -> bool:
+    owner, attribute = (model.opt, name[4:]) if name.startswith("opt.") else (model, name)
+    return hasattr(owner, attribute)

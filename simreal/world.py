@@ -1,0 +1,76 @@
+"""One episode's reality."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+
+@struct.dataclass
+class World:
+    """The values that make one world differ from the nominal one; a plain pytree.
+
+    Where the randomizer has mid-episode events, `model`, `actuator`, `sensor`, `disturbance` and `number` have
+    a leading axis of stages (stage k: the k earliest events have happened) and `event_times` says when each
+    stage after the first begins; `at` picks the stage. Without events there is no such axis.
+    """
+
+    model: dict[str, jax.Array]
+    """MuJoCo model field -> whole array, only the fields that vary and the constants derived from them."""
+    actuator: dict[str, jax.Array]
+    """Actuator effect parameter -> (nu,), see `simreal.actuators`."""
+    sensor: dict[str, jax.Array]
+    """Sensor effect parameter -> (channels,), see `simreal.sensors`."""
+    disturbance: dict[str, jax.Array]
+    """Disturbance parameter -> scalar, see `simreal.disturbances`."""
+    draws: dict[str, jax.Array]
+    """Factor -> raw draw, scalar or one per addressed element."""
+    normalized: jax.Array
+    """All draws mapped to [-1, 1] and concatenated: what a privileged critic sees."""
+    number: jax.Array
+    """(2,) uint32 digest of `model`: engines rewrite a row only when it changes."""
+    event_times: jax.Array
+    """(events,) s, sorted; empty without events."""
+    variant: jax.Array
+    """int32, room for a structural variant (another terrain or object); 0 today."""
+
+    def at(self, time: jax.Array) -> World:
+        """The world as it is at `time` (s) of the episode: events before it have happened."""
+        if self.event_times.shape[-1] == 0:
+            return self
+        stage = jnp.sum(time >= self.event_times)
+        varying = (self.model, self.actuator, self.sensor, self.disturbance, self.number)
+        model, actuator, sensor, disturbance, number = jax.tree.map(lambda x: x[stage], varying)
+        return self.replace(  # type: ignore[attr-defined]
+            model=model,
+            actuator=actuator,
+            sensor=sensor,
+            disturbance=disturbance,
+            number=number,
+            event_times=self.event_times[:0],
+        )
+
+
+def digest(arrays: dict[str, jax.Array]) -> jax.Array:
+    """(2,) uint32 content hash of a dictionary of arrays: equal contents, equal digest.
+
+    Two multiply-xor hashes of the bit patterns with different odd multipliers per element; unequal contents
+    collide with probability of about 2**-64.
+    """
+    if not arrays:
+        return jnp.zeros((2,), jnp.uint32)
+    bits = jnp.concatenate([_bits(arrays[name]) for name in sorted(arrays)])
+    index = np.arange(1, bits.size + 1, dtype=np.uint32)
+    lanes = np.stack([index * np.uint32(0x9E3779B1), index * np.uint32(0x85EBCA77)])
+    mixed = (bits ^ lanes) * jnp.uint32(0xC2B2AE3D)
+    mixed = (mixed ^ (mixed >> 15)) * jnp.uint32(0x27D4EB2F)
+    return jnp.sum(mixed ^ (mixed >> 16), axis=1, dtype=jnp.uint32)
+
+
+def _bits(x: jax.Array) -> jax.Array:
+    """The bit pattern of an array as flat uint32."""
+    if x.dtype == jnp.bool_ or jnp.issubdtype(x.dtype, jnp.integer):
+        return x.astype(jnp.uint32).reshape(-1)
+    return jax.lax.bitcast_convert_type(x, jnp.uint32).reshape(-1)
