@@ -80,12 +80,15 @@ class Checkpoints:
             kept = "there is no earlier one" if last is None else f"the one at step {last} is intact"
             raise UserError(f"cannot save a checkpoint in {self.folder}: {reason}; {kept}") from error
 
-    def restore(self, like: Tree, say: Callable[[str], None]) -> tuple[int, Tree] | None:
+    def restore(
+        self, like: Tree, say: Callable[[str], None], partial: bool = False
+    ) -> tuple[int, Tree] | None:
         """The newest sound checkpoint.
 
         Args:
             like: a state of the same structure, such as a fresh one; its values do not matter.
             say: called with one line for each damaged checkpoint that is passed over.
+            partial: whether `like` may lack some of what was saved.
 
         Returns:
             Step and state, or None where nothing was ever saved.
@@ -96,7 +99,7 @@ class Checkpoints:
         for step in reversed(self.steps()):
             flaw = _flaw(self.folder / str(step))
             if flaw is None:
-                return step, _unflatten(like, self._read(step), f"{self.folder / str(step)}")
+                return step, _unflatten(like, self._read(step), f"{self.folder / str(step)}", partial)
             say(f"checkpoint {self.folder / str(step)} is damaged ({flaw}); falling back to the one before")
         if self.steps():
             raise UserError(f"no usable checkpoint in {self.folder}: all {len(self.steps())} are damaged")
@@ -140,10 +143,10 @@ def _is_key(leaf: Any) -> bool:
     return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _unflatten(like: Tree, saved: dict[str, np.ndarray], where: str) -> Tree:
+def _unflatten(like: Tree, saved: dict[str, np.ndarray], where: str, partial: bool) -> Tree:
     leaves, structure = jax.tree_util.tree_flatten_with_path(like)
     expected = {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
-    for name in [*expected, *saved]:
+    for name in expected if partial else [*expected, *saved]:
         there = _shape(saved[name]) if name in saved else "absent"
         here = _shape(_raw(expected[name])) if name in expected else "absent"
         empty = name in expected and name not in saved and not expected[name].size
