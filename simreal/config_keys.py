@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 from collections.abc import Iterator, Sequence
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
@@ -51,8 +52,13 @@ def _keys(cls: type, prefix: str) -> Iterator[tuple[str, Key]]:
         if dataclasses.is_dataclass(info.annotation):
             yield from _keys(info.annotation, f"{prefix}{name}.")
             continue
-        default = "" if info.is_required() else str(info.get_default(call_default_factory=True))
+        default = "" if info.is_required() else _written(info.get_default(call_default_factory=True))
         yield f"{prefix}{name}", Key(_kind(info.annotation), default, info.description or "")
+
+
+def _written(value: Any) -> str:
+    """A default as it would stand in a YAML file."""
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _kind(annotation: Any) -> str:

@@ -8,6 +8,7 @@ import json
 import math
 import os
 import platform
+import shlex
 import subprocess
 import sys
 import time
@@ -191,7 +192,7 @@ def session() -> dict[str, Any]:
     device = jax.devices()[0]
     return {
         "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "device": {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()},
         "cpu_affinity": cpu_affinity(),
         "python": platform.python_version(),

@@ -7,6 +7,10 @@ from types import FrameType, TracebackType
 from typing import Any
 
 
+class Interrupted(Exception):
+    """Training was asked to stop and has saved its state; the message is the line for the user."""
+
+
 class StopRequest:
     """Turns the first SIGINT or SIGTERM into a wish; a second one acts as it does without us."""
 

@@ -21,7 +21,7 @@ from simreal.errors import UserError
 from simreal.progress import Progress
 from simreal.resuming import check_config, check_manifest, take_policy
 from simreal.runs import Run
-from simreal.stopping import StopRequest
+from simreal.stopping import Interrupted, StopRequest
 
 if TYPE_CHECKING:
     from simreal.environment import Environment
@@ -29,10 +29,6 @@ if TYPE_CHECKING:
 
 TARGET_EPOCHS = 3
 """Epochs in a row that must reach `target_success` before training ends early."""
-
-
-class Interrupted(Exception):
-    """Training was asked to stop and has saved its state; the message is the line for the user."""
 
 
 def make_environment(config: RunConfig, engine: str | None = None) -> Environment:

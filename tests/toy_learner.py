@@ -21,7 +21,8 @@ from flax import struct
 
 from simreal.config import CheckpointConfig, RunConfig
 from simreal.errors import UserError
-from simreal.training import Interrupted, train
+from simreal.stopping import Interrupted
+from simreal.training import train
 
 STEPS_PER_EPOCH = 100
 
