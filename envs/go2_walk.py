@@ -169,7 +169,8 @@ class Go2Walk(Environment):
         off = jnp.square(velocity[0] - task.command) + jnp.square(velocity[1])
         bent = data.qpos[self._qpos] - jnp.asarray(HOME, data.qpos.dtype)
         rate = (
-            2.0 * jnp.exp(-off / 0.25)
+            1.2 * jnp.exp(-off / 0.25)
+            + 1.2 * jnp.exp(-off / 0.04)
             + 0.75 * jnp.exp(-jnp.square(spin[2]) / 0.25)
             + 0.2
             - 2.0 * jnp.square(velocity[2])

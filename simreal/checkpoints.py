@@ -105,6 +105,10 @@ class Checkpoints:
             raise UserError(f"no usable checkpoint in {self.folder}: all {len(self.steps())} are damaged")
         return None
 
+    def raw(self) -> dict[str, np.ndarray]:
+        """Everything that the newest checkpoint holds, by its path in the state; no structure is needed."""
+        return self._read(self.steps()[-1])
+
     def _read(self, step: int) -> dict[str, np.ndarray]:
         import orbax.checkpoint as ocp
 

@@ -13,11 +13,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
-from brax.training import types
-from brax.training.acme import running_statistics, specs
-from brax.training.agents.ppo import losses, optimizer
 from flax import struct
 
+from simreal.brax_parts import losses, optimizer, running_statistics, specs, types
 from simreal.config import RunConfig
 from simreal.environment import Environment
 from simreal.networks import make_networks
@@ -102,7 +100,7 @@ class Learner:
             value=self.networks.value_network.init(value_key),
         )
         sizes = jax.tree.map(lambda o: specs.Array(o.shape, o.dtype), self._observations)
-        return TrainingState(
+        state = TrainingState(
             params=params,
             optimizer=self.optimizer.init(params),
             normalizer=running_statistics.init_state(sizes),
@@ -112,6 +110,9 @@ class Learner:
             key=key,
             steps=jnp.zeros((), jnp.uint32),
         )
+        # A copy of each leaf: `epoch` donates them, and a buffer that two leaves share can only be given once. The
+        # explicit type takes away weak types, for which the first epoch would compile a program of its own.
+        return jax.tree.map(lambda x: jnp.array(x, dtype=jnp.result_type(x)), state)
 
     def epoch(self, state: TrainingState) -> tuple[TrainingState, Metrics]:
         """`iterations_per_epoch` times collect and update. The state passed in is used up."""
@@ -208,7 +209,7 @@ class Learner:
             change, new_optimizer_state = self.optimizer.update(gradient, optimizer_state)
             new_params = optax.apply_updates(params, change)
             # A gradient that is not finite is skipped and counted: it would be in the parameters for ever.
-            fine = jnp.isfinite(optax.global_norm(gradient))
+            fine = jnp.isfinite(optax.tree.norm(gradient))
             kept = jax.tree.map(
                 lambda new, old: jnp.where(fine, new, old),
                 (new_params, new_optimizer_state),

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-from brax.training import networks as brax_networks
-from brax.training.acme import running_statistics
-from brax.training.agents.ppo import networks as ppo_networks
 
+from simreal.brax_parts import networks as brax_networks
+from simreal.brax_parts import ppo_networks, running_statistics
 from simreal.config import LearnerConfig, NetworkConfig
 
 

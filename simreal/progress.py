@@ -60,14 +60,16 @@ class Progress:
             self._last_line = time.monotonic()
 
     def _line(self, row: Mapping[str, Any]) -> str:
-        (first_step, began), (step, now) = self._recent[0], self._recent[-1]
-        # The first row's own speed is mostly compilation; later rows replace it.
-        speed = (step - first_step) / (now - began) if now > began else row["steps_per_second"]
-        left = max(self.total - step, 0) / speed if speed > 0 else math.inf
-        return (
-            f"{_count(step)} of {_count(self.total)} steps   return {_number(row['episode_return'])}   "
-            f"success {_percent(row['success_rate'])}   {speed:,.0f} steps/s   {_duration(left)} left"
+        line = (
+            f"{_count(row['step'])} of {_count(self.total)} steps   "
+            f"return {_number(row['episode_return'])}   success {_percent(row['success_rate'])}"
         )
+        (first_step, began), (step, now) = self._recent[0], self._recent[-1]
+        if step == first_step or now <= began:  # the first epoch's own speed is that of the compiler
+            return line
+        speed = (step - first_step) / (now - began)
+        left = max(self.total - step, 0) / speed
+        return f"{line}   {speed:,.0f} steps/s   {_duration(left)} left"
 
 
 def _count(steps: int) -> str:
@@ -83,8 +85,6 @@ def _percent(value: float | None) -> str:
 
 
 def _duration(seconds: float) -> str:
-    if not math.isfinite(seconds):
-        return "?"
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

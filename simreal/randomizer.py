@@ -115,6 +115,9 @@ class Bound:
     size: int
     """Number of draws: 1, or one per addressed element."""
     nominal: float
+    """The draw that changes nothing."""
+    lowest: float
+    """Smallest draw that leaves every addressed value possible."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -317,7 +320,11 @@ class WorldBuilder:
         nominal = values[mask]
         _check_support(where, factor, nominal, lowest, strict)
         identity = _IDENTITY.get(factor.operation, float(nominal[0]))
-        return Bound(factor, "x" if factor.operation == "times" else unit, mask, int(mask.sum()), identity)
+        least = lowest + (1e-3 * max(float(np.max(np.abs(nominal))), 1e-3) if strict else 0.0)
+        smallest = {"times": 1e-3, "plus": least - float(np.min(nominal)), "set": least}[factor.operation]
+        return Bound(
+            factor, "x" if factor.operation == "times" else unit, mask, int(mask.sum()), identity, smallest
+        )
 
     @staticmethod
     def _physical_values(model: mujoco.MjModel, target, names: list[str]) -> np.ndarray:

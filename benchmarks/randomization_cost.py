@@ -1,0 +1,88 @@
+"""What fresh worlds cost: environment steps/s with everything varying, against nominal worlds and a cached reset.
+
+Both sides have the same actuators and sensors. Actions are small noise about zero, so that episodes end by their
+time limit, staggered over the worlds.
+
+    python benchmarks/randomization_cost.py [environment:engine ...]
+"""
+
+from __future__ import annotations
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from timing import interleaved, machine
+
+import simreal
+from simreal.rollout import Rollout, RolloutState
+
+WORLDS = 512
+DEFAULT = ("go2_walk:mujoco", "arm_reach:mujoco", "arm_reach:mjx", "cartpole_swingup:mujoco", "cartpole_swingup:mjx")
+
+
+class CachedRollout(Rollout):
+    """Every world starts again from its first state: what a rollout without randomisation may do."""
+
+    def renew(self, state: RolloutState, ranges) -> RolloutState:
+        done = state.env.done > 0
+
+        def choose(now, first):
+            return jnp.where(done.reshape((-1,) + (1,) * (now.ndim - 1)), first, now)
+
+        # The noise goes on; all else is as at the first start.
+        first = self.first.replace(env=self.first.env.replace(key=state.env.key))
+        return jax.tree.map(choose, state, first)
+
+
+def caller(rollout: Rollout, steps: int):
+    """A call that steps the worlds on by `steps` from where the last call left them."""
+    ranges = rollout.env.randomizer.ranges
+
+    @jax.jit
+    def run(state, key):
+        def one(state, key):
+            state = rollout.renew(state, ranges)
+            action = 0.05 * jax.random.normal(key, (rollout.worlds, rollout.env.action_size))
+            state, _ = rollout.step(state, action)
+            return state, None
+
+        return jax.lax.scan(one, state, jax.random.split(key, steps))[0]
+
+    holder = {"state": None, "key": jax.random.PRNGKey(1)}
+
+    def call():
+        holder["key"], key = jax.random.split(holder["key"])
+        holder["state"] = run(holder["state"], key)
+        return holder["state"].episode_return
+
+    return holder, call
+
+
+def compare(name: str, engine: str, pairs: int = 15) -> float:
+    env = simreal.make(name, engine=engine)
+    steps = max(20, env.episode_steps // 10)
+    fresh = Rollout(env, WORLDS)
+    nominal = CachedRollout(env, WORLDS, draw_world=lambda key, ranges: env.randomizer.build({}))
+    fresh_holder, fresh_call = caller(fresh, steps)
+    fresh_holder["state"] = fresh.start(jax.random.PRNGKey(0))
+    nominal_holder, nominal_call = caller(nominal, steps)
+    started = jax.jit(lambda s: Rollout.renew(nominal, s, env.randomizer.ranges))(nominal.start(jax.random.PRNGKey(0)))
+    nominal.first = started.replace(env=started.env.replace(steps=jnp.zeros_like(started.env.steps)))
+    nominal_holder["state"] = started
+    times = interleaved(fresh_call, nominal_call, pairs)
+    speeds = WORLDS * steps / times
+    ratio = float(np.median(speeds[:, 0] / speeds[:, 1]))
+    print(
+        f"{name:18s} {engine:7s} fresh {np.median(speeds[:, 0]):9,.0f} steps/s   nominal, cached "
+        f"{np.median(speeds[:, 1]):9,.0f} steps/s   ratio {ratio:.3f}",
+        flush=True,
+    )
+    return ratio
+
+
+if __name__ == "__main__":
+    print(machine())
+    for case in sys.argv[1:] or DEFAULT:
+        compare(*case.split(":"))
