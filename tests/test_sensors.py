@@ -171,6 +171,13 @@ def test_a_held_reading_keeps_its_noise():
     assert 99 <= (np.diff(out) != 0).sum() <= 101
 
 
+def test_a_lost_sample_is_not_made_up_for_before_the_next_one():
+    out = read(make({"rate", "dropout"}), {"rate": 50, "dropout": 0.3}, np.arange(1001), worlds=30)[..., 0]
+    new = np.diff(out, axis=1) > 0
+    np.testing.assert_allclose(new.mean(), 0.1 * 0.7, rtol=0.06)
+    assert all((np.diff(np.flatnonzero(world)) % 10 == 0).all() for world in new)
+
+
 def test_dropout_repeats_the_last_reading_with_its_probability():
     chance = np.array([0.0, 0.1, 0.5, 1.0])
     out = read(make({"dropout"}, n=4), {"dropout": chance}, np.arange(1001), worlds=20)
