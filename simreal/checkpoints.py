@@ -7,6 +7,7 @@ The digests are checked before Orbax sees the files, because it answers damaged 
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import logging
@@ -25,7 +26,10 @@ from simreal.errors import UserError
 Tree = TypeVar("Tree")
 
 SEAL = "sha256.json"
-ROOM = 2.0  # free bytes asked for, per byte of state
+ROOM = 2.0
+"""Free bytes asked for per byte of state, and `SPARE` more: a disk that fills up while Orbax writes ends in
+pages of traces, so that is seen before."""
+SPARE = 2_000_000
 
 
 class Checkpoints:
@@ -199,6 +203,8 @@ def _disk_trouble(error: OSError | ValueError) -> str | None:
 
 
 def _check_room(folder: Path, size: int) -> None:
-    free = shutil.disk_usage(folder).free
-    if free < ROOM * size:
-        raise OSError(0, f"only {free / 1e6:.0f} MB are free on the disk, {ROOM * size / 1e6:.0f} are needed")
+    free, needed = shutil.disk_usage(folder).free, ROOM * size + SPARE
+    if free < needed:
+        raise OSError(
+            errno.ENOSPC, f"only {free / 1e6:.1f} MB are free on the disk, {needed / 1e6:.1f} are needed"
+        )

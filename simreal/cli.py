@@ -92,8 +92,13 @@ def _list(given: argparse.Namespace) -> int:
 def _build_train(parser: argparse.ArgumentParser) -> None:
     from simreal.config_keys import config_keys
 
-    parser.usage = "simreal train CONFIG [--key.path VALUE ...] [--out DIR] [--resume] [--from RUN]"
-    parser.add_argument("config", metavar="CONFIG", help="name of a shipped configuration, or a YAML file")
+    parser.usage = (
+        "simreal train CONFIG [--key.path VALUE ...] [--out DIR] [--resume] [--from RUN]\n"
+        "       simreal train --resume --out DIR"
+    )
+    parser.add_argument(
+        "config", metavar="CONFIG", nargs="?", help="name of a shipped configuration, or a YAML file"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder; default: runs/CONFIG-SEED")
     parser.add_argument(
         "--resume", action="store_true", help="go on from the newest checkpoint in the folder"
@@ -109,11 +114,19 @@ def _build_train(parser: argparse.ArgumentParser) -> None:
 
 
 def _train(given: argparse.Namespace) -> int:
-    from simreal.config_files import load_config
-    from simreal.runs import new_folder, newest_folder
+    from simreal.config_files import load_config, shipped_configs
+    from simreal.runs import Run, new_folder, newest_folder
 
-    config = load_config(given.config, given.overrides)
-    name = Path(given.config).stem
+    source = given.config
+    if source is None and given.resume and given.out is not None:
+        source = Run.open(given.out).config_file
+    if source is None:
+        raise UserError(
+            f"train: no CONFIG; valid: {', '.join(shipped_configs())}, or the path of a YAML file"
+        )
+    config = load_config(source, given.overrides)
+    # The resolved file of a run is always called config.yaml, which names nothing.
+    name = config.environment if Path(source).name == "config.yaml" else Path(source).stem
     out = given.out or (newest_folder if given.resume else new_folder)(name, config.seed)
     _set_up_jax()
     from simreal.training import train

@@ -53,6 +53,8 @@ BAD_TRAINING = {
     "delay beyond the buffer": (["arm_reach", "--randomizer.motor_delay", "[0, 5]"], "motor_delay"),
     "unknown engine": (["arm_reach", "--engine", "warp"], "'mujoco'"),
     "no configuration": ([], "CONFIG"),
+    "resume without a folder": (["--resume"], "CONFIG"),
+    "resume what is not there": (["--resume", "--out", "gone"], "no run in 'gone'"),
     "one argument too many": (["arm_reach", "go2_walk"], "go2_walk"),
     "nothing to resume": (["arm_reach", "--resume", "--out", "gone"], "no run in 'gone'"),
     "nothing to start from": (["arm_reach", "--from", "gone"], "no run in 'gone'"),
