@@ -16,6 +16,12 @@ KEY = jax.random.PRNGKey(0)
 EVERYTHING = frozenset(EFFECTS)
 
 
+@pytest.fixture(autouse=True)
+def strict_promotion():
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        yield
+
+
 def make(effects, substeps=1, nu=1, max_delay=0.0, ctrlrange=(-1.0, 1.0)):
     names = tuple(f"motor_{i}" for i in range(nu))
     return Actuators(names, (ctrlrange,) * nu, DT, substeps, frozenset(effects), max_delay)

@@ -16,6 +16,12 @@ KEY = jax.random.PRNGKey(0)
 EVERYTHING = frozenset(EFFECTS)
 
 
+@pytest.fixture(autouse=True)
+def strict_promotion():
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        yield
+
+
 def make(effects, substeps=1, n=1, max_delay=0.0):
     channels = tuple(f"angle[{i}]" for i in range(n))
     return Sensors(channels, PHYSICS_DT * substeps, frozenset(effects), max_delay)
