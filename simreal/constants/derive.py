@@ -56,8 +56,8 @@ def derived_constants(
     `varied` names fields of MjModel, with `opt.` before those of MjOption. The function takes whole arrays in
     MjModel's shapes under these names, for one world (vmap it for many), and returns whole arrays in the
     dtype of its inputs: those that depend on what varies and no others, so for damping or friction none.
-    Fields that do not vary keep the values that `model` had when this was called; what follows from them alone
-    is calculated in NumPy while tracing.
+    Fields that do not vary keep the values that `model` had when this was called; what follows from them
+    alone is calculated in NumPy while tracing.
 
     Derived: body_subtreemass, dof_M0, body_invweight0, dof_invweight0, tendon_invweight0, tendon_length0,
     actuator_acc0, actuator_length0, eq_data (anchors, and the pose of a weld without relpose), geom_rbound,
@@ -77,7 +77,8 @@ def derived_constants(
     Quaternions that are not of unit length are taken as the rotations that they stand for, where C scales.
 
     Raises UserError for a name that the model does not have, and for what is not supported: flexes, actuators
-    with SO(3) transmission, geom_aabb, geom_fluid, hfield_size, and sizes of geoms with ellipsoid fluid forces.
+    with SO(3) transmission, geom_aabb, geom_fluid, hfield_size, and sizes of geoms with ellipsoid fluid
+    forces.
     """
     names = frozenset(varied)
     _check(model, names)

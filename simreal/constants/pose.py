@@ -202,7 +202,7 @@ class Pose:
 def longest(lengths: Array, groups: list[list[int]]) -> Array:
     """Largest of `lengths` (n,) in each group of indices, 0 for an empty group: (groups,)."""
     width = max((len(group) for group in groups), default=0)
-    index = np.array([group + [-1] * (width - len(group)) for group in groups], int).reshape(-1, width)
+    index = np.array([group + [-1] * (width - len(group)) for group in groups], int)
     xp = module(lengths)
     padded = xp.concatenate([lengths, xp.zeros(1, lengths.dtype)])
     return padded[index].max(1) if width else xp.zeros(len(groups), lengths.dtype)
