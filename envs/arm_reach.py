@@ -31,9 +31,6 @@ MODEL = """
     <light pos="0 -1 4" dir="0 .2 -1" directional="true"/>
     <camera name="top" pos="0 0 4.6" xyaxes="1 0 0 0 1 0"/>
     <geom name="table" type="plane" size="3 3 .1" pos="0 0 -.1" material="grid"/>
-    <body name="target" mocap="true" pos="1 .5 0">
-      <geom name="target" type="sphere" size=".05" rgba=".85 .2 .2 .7"/>
-    </body>
     <body name="upper_link">
       <joint name="shoulder" type="hinge" axis="0 0 1" damping="1.0" armature="0.05"/>
       <geom name="upper_link" type="capsule" fromto="0 0 0 1 0 0" size=".04" mass="3.0" rgba=".20 .35 .60 1"/>
@@ -142,6 +139,12 @@ class ArmReach(Environment):
 
     def succeeded(self, task: Reach):
         return task.steps >= round(HOLD / self.control_dt)
+
+    def camera(self, model):
+        return "top"
+
+    def markers(self, task: Reach):
+        return [(task.target, 0.05)]
 
 
 def tip(angles: jax.Array) -> jax.Array:

@@ -128,3 +128,6 @@ class CartpoleSwingup(Environment):
 
     def succeeded(self, task: Held):
         return task.steps >= round(HOLD / self.control_dt)
+
+    def camera(self, model):
+        return "side"

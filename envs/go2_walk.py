@@ -108,6 +108,11 @@ class Go2Walk(Environment):
         model.opt.timestep = self.physics_dt
         return model
 
+    def camera(self, model):
+        from simreal.video import tracking_camera
+
+        return tracking_camera(model, "base", distance=1.3, azimuth=90.0, elevation=-12.0)
+
     def control(self, action):
         return jnp.asarray(HOME, action.dtype) + ACTION_SCALE * action
 

@@ -137,8 +137,8 @@ class EvaluationConfig:
     """Worlds at each of these values."""
     heat_map: bool = True
     """Whether success is also mapped over the two factors that matter most."""
-    video: bool = False
-    """Whether an episode is filmed."""
+    video: bool = True
+    """Whether the report shows an episode; needs OpenGL, and goes on without."""
 
 
 @dataclass(frozen=True, config=SETTINGS)

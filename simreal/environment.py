@@ -131,6 +131,18 @@ class Environment(abc.ABC):
         """What a critic may see beyond the clean observation and the world's draws."""
         return jnp.zeros(0, data.qpos.dtype)
 
+    def render_model(self) -> mujoco.MjModel:
+        """The model for pictures; with visual meshes where training goes without them."""
+        return self.mj_model
+
+    def camera(self, model: mujoco.MjModel) -> Any:
+        """The camera for pictures: a name, an MjvCamera, or None for the free camera."""
+        return None
+
+    def markers(self, task: Task) -> list[tuple[Any, float]]:
+        """Spheres to draw for the task, (position, radius) in m: a target, for example. NumPy leaves."""
+        return []
+
     # -- construction --------------------------------------------------------------------------------------
 
     def __init__(
@@ -159,6 +171,7 @@ class Environment(abc.ABC):
             substeps=self.substeps,
             push_body=self._push_body(factors),
             varies_period="period_jitter" in self.actuators.effects,
+            limits_force=bool(self.actuators.effects & {"no_load_speed", "thermal_limit"}),
         )
         self.engine_name = resolve(engine)
 
@@ -290,8 +303,6 @@ class Environment(abc.ABC):
         controls, actuator = self.actuators.controls(
             now.actuator, state.actuator, self.control(action), actuator_key
         )
-        if not self.actuators.effects & {"delay", "lag", "backlash"}:
-            controls = controls[:1]
         inputs = Inputs(
             controls=controls,
             limits=self.actuators.limits(now.actuator, actuator, self._force_limit(now)),

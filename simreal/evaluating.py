@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from rich.console import Console
 
 from simreal.errors import UserError
@@ -87,10 +88,11 @@ def evaluate(request: Request, as_json: bool = False) -> list[str]:
     console = Console(stderr=True, highlight=False)
     with console.status("compiling") as status:
         evaluation = evaluate_run(request, note=status.update)
-        status.update("writing the report")
         run = request.run
         content = transfer(evaluation)
         write_transfer(content, run.folder / "transfer.json")
+        video = _film(request, evaluation, status.update)
+        status.update("writing the report")
         page = write_report(
             run.folder,
             evaluation,
@@ -99,6 +101,7 @@ def evaluate(request: Request, as_json: bool = False) -> list[str]:
             run.manifest(),
             run.config_file.read_text(encoding="utf-8"),
             shlex.join(["simreal", *sys.argv[1:]]),
+            video,
         )
     print(json.dumps(content, indent=2) if as_json else f"{terminal_table(content)}\n\nreport: {page}")
     return requirements.check(request.requirements, content)
@@ -148,6 +151,30 @@ def evaluate_run(request: Request, note: Note = lambda text: None) -> Evaluation
         factors=curves,
         heat_map=heat_map,
     )
+
+
+def _film(request: Request, evaluation: Evaluation, note: Note) -> Path | None:
+    """An episode in a world of the `train` set, as an animation for the report; None where none is wanted or can be.
+
+    The episode is the one whose return is the median of the set: typical, not the best.
+    """
+    if not request.run.config().evaluation.video or "train" not in evaluation.sets:
+        return None
+    from simreal.evaluation.film import film, record
+    from simreal.policy import load_policy
+    from simreal.training import make_environment
+    from simreal.video import RenderingUnavailable
+
+    note("filming")
+    env = make_environment(request.run.config(), evaluation.engine)
+    shown = evaluation.sets["train"]
+    median = int(np.argsort(shown.episode_return)[len(shown.episode_return) // 2])
+    episode = record(env, load_policy(request.run.folder), shown.draws, median, evaluation.seed)
+    try:
+        return film(env, episode, request.run.folder / "plots", "train_median")
+    except RenderingUnavailable as error:
+        Console(stderr=True, highlight=False).print(f"no pictures: {error}")
+        return None
 
 
 def _run_set(evaluator: Evaluator, worldset: WorldSet, worlds: int) -> SetResult:

@@ -11,8 +11,12 @@ import mujoco
 import numpy as np
 from flax import struct
 
+from simreal.actuators import limit_control
 from simreal.errors import UserError
 from simreal.world import World
+
+
+_UNLIMITED = (-np.inf, np.inf)
 
 
 @struct.dataclass
@@ -70,6 +74,8 @@ class Engine(abc.ABC):
         data_fields: what `Data` holds besides its own fields, names as in `MjData`.
         substeps: physics steps per control step.
         push_body: id of the body that pushes act on, or None.
+        varies_period: whether `Inputs.period_scale` will be given.
+        limits_force: whether `Inputs.limits` will be given.
     """
 
     name: str
@@ -81,18 +87,39 @@ class Engine(abc.ABC):
         data_fields: tuple[str, ...],
         substeps: int,
         push_body: int | None = None,
+        varies_period: bool = False,
+        limits_force: bool = False,
     ) -> None:
-        self.model = model
+        self.model = mujoco.MjModel.__copy__(model)
+        if limits_force:
+            # A limited force may need a control outside ctrlrange, which MuJoCo would clamp back; `limited` clamps
+            # before it limits.
+            self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
         self.varied = varied
         self.data_fields = data_fields
         self.substeps = substeps
         self.push_body = push_body
+        self.varies_period = varies_period
         joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
         joints = np.where(joint, model.actuator_trnid[:, 0], 0)
-        self.joint_driven = np.asarray(joint, bool)
         self._qposadr = model.jnt_qposadr[joints] if model.njnt else joints
         self._dofadr = model.jnt_dofadr[joints] if model.njnt else joints
         self._gear = np.where(joint, model.actuator_gear[:, 0], 0.0)
+
+    def limited(self, xp: Any, control: Any, physics: Any, gain: Any, bias: Any, limits: dict[str, Any]) -> Any:
+        """The control (..., nu) whose force stays inside the torque-speed curve, in NumPy or JAX.
+
+        Args:
+            xp: numpy or jax.numpy.
+            control: what is commanded, (..., nu).
+            physics: has `qpos` and `qvel`, (..., nq) and (..., nv).
+            gain: (..., nu) and bias: (..., nu, 3), of the actuators.
+            limits: from `simreal.actuators.Actuators.limits`.
+        """
+        low, high = np.where(self.model.actuator_ctrllimited[:, None], self.model.actuator_ctrlrange, _UNLIMITED).T
+        velocity = physics["qvel"][..., self._dofadr] * self._gear
+        length = physics["qpos"][..., self._qposadr] * self._gear
+        return limit_control(xp, xp.clip(control, low, high), velocity, length, gain, bias, limits)
 
     def initial(self, qpos: jax.Array, qvel: jax.Array) -> Physics:
         """The integration state at the start of an episode."""

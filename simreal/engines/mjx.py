@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from simreal.actuators import limit_control
 from simreal.engines.base import Data, Engine, Inputs, Physics, refuse_reverse_gradient
 from simreal.errors import UserError
 from simreal.quiet import import_mjx
@@ -17,8 +16,9 @@ from simreal.world import World
 
 mjx = import_mjx()
 
-_LIFTED = 1e-12
-"""Stands in for a nominal zero that varies, so that MJX does not compile its effect away."""
+_LIFTED = 1e-9
+"""Least friction loss (N m) of a joint whose friction loss varies. MJX compiles a nominal zero away, and takes a row
+of zero friction for an equality constraint, which locks the joint."""
 
 
 class MjxEngine(Engine):
@@ -26,7 +26,7 @@ class MjxEngine(Engine):
 
     name = "mjx"
 
-    def __init__(self, *args: Any, varies_period: bool = False, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         if np.any(self.model.actuator_delay > 0):
             names = [self.model.actuator(i).name for i in np.flatnonzero(self.model.actuator_delay > 0)]
@@ -46,14 +46,17 @@ class MjxEngine(Engine):
         self._known = tuple(
             n for n in self.varied if _has(self._mjx_model, n) and not n.endswith("sameframe")
         )
-        self._guard = self.model.opt.iterations > 1
+        constrained = self._mjx_data._impl.efc_J.size > 0
+        self._guard = constrained and self.model.opt.iterations > 1  # a while loop inside the solver
 
     def _load(self, world: World, physics: Physics) -> tuple[Any, Any]:
-        model = self._mjx_model.tree_replace({name: world.model[name] for name in self._known})
-        qpos = refuse_reverse_gradient(physics.qpos) if self._guard else physics.qpos
+        fields = {name: world.model[name] for name in self._known}
+        if "dof_frictionloss" in fields:
+            fields["dof_frictionloss"] = jnp.maximum(fields["dof_frictionloss"], _LIFTED)
+        model = self._mjx_model.tree_replace(fields)
         data = self._mjx_data.replace(
             time=physics.time,
-            qpos=qpos,
+            qpos=physics.qpos,
             qvel=physics.qvel,
             act=physics.act,
             qacc_warmstart=physics.qacc_warmstart,
@@ -76,13 +79,16 @@ class MjxEngine(Engine):
 
         def substep(data: Any, control: jax.Array) -> tuple[Any, None]:
             if inputs.limits:
-                velocity = data.qvel[self._dofadr] * self._gear
-                length = data.qpos[self._qposadr] * self._gear
                 gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm[:, :3]
-                control = limit_control(jnp, control, velocity, length, gain, bias, inputs.limits)
+                moving = {"qpos": data.qpos, "qvel": data.qvel}
+                control = self.limited(jnp, control, moving, gain, bias, inputs.limits)
             return mjx.step(model, data.replace(ctrl=control)), None
 
         data, _ = jax.lax.scan(substep, data, controls)
+        if self._guard:
+            data = data.replace(
+                qpos=refuse_reverse_gradient(data.qpos), qvel=refuse_reverse_gradient(data.qvel)
+            )
         moved = Physics(data.time, data.qpos, data.qvel, data.act, data.qacc_warmstart)
         return moved, self._read(self._current(model, data), moved)
 

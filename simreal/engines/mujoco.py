@@ -22,7 +22,6 @@ import mujoco
 import numpy as np
 from mujoco import batch as mujoco_batch
 
-from simreal.actuators import limit_control
 from simreal.engines.base import Data, Engine, Inputs, Physics, refuse_gradient
 from simreal.world import World
 
@@ -57,11 +56,9 @@ class MujocoEngine(Engine):
 
     name = "mujoco"
 
-    def __init__(self, *args: Any, varies_period: bool = False, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         _quiet_log()
-        self.varies_period = varies_period
-        self.model = mujoco.MjModel.__copy__(self.model)
         # A world that blows up shall come back not finite, not silently reset to qpos0.
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         self.outputs = ("actuator_force", "actuator_velocity", *self.data_fields)
@@ -130,11 +127,9 @@ class MujocoEngine(Engine):
         for k in range(self.substeps):
             control = controls[:, min(k, controls.shape[1] - 1)]
             if limits:
-                velocity = rows.state["qvel"][:, self._dofadr] * self._gear
-                length = rows.state["qpos"][:, self._qposadr] * self._gear
                 gain = rows.fields.get("actuator_gainprm", self.model.actuator_gainprm[None])[..., 0]
                 bias = rows.fields.get("actuator_biasprm", self.model.actuator_biasprm[None])[..., :3]
-                control = limit_control(np, control, velocity, length, gain, bias, limits)
+                control = self.limited(np, control, rows.state, gain, bias, limits)
             ctrl[:] = control
             last = k == self.substeps - 1
             rows.batch.step(nstep=1, stage=velocity_stage if last else mujoco.mjtStage.mjSTAGE_NONE)
