@@ -3,10 +3,12 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# Robot models of the MuJoCo Menagerie, where this checkout has them beside it; downloaded on first use otherwise.
+export MENAGERIE_ROOT ?= $(wildcard $(abspath ../shared/menagerie))
 # Go on with a run that an earlier, interrupted call left; start it otherwise.
 resume = $(if $(wildcard $(1)/config.yaml),--resume)
 
-.PHONY: help install demo demo-go2 test check bench clean
+.PHONY: help install demo demo-go2 test check study bench clean
 
 help:
 	@echo 'make install    create $(VENV) from the pinned constraints'
@@ -14,6 +16,7 @@ help:
 	@echo 'make demo-go2   the same for go2_walk, in runs/demo-go2'
 	@echo 'make test       run the test suite'
 	@echo 'make check      ruff and mypy'
+	@echo 'make study      randomised against nominal training, several seeds (an hour; can be interrupted)'
 	@echo 'make bench      run the benchmarks'
 
 install: $(STAMP)
@@ -42,8 +45,12 @@ check: $(STAMP)
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
+study: $(STAMP)
+	$(BIN)/python benchmarks/randomization_study.py
+
 bench: $(STAMP)
-	@for script in benchmarks/[a-z]*.py; do echo "== $$script"; $(BIN)/python $$script || exit 1; done
+	$(BIN)/python benchmarks/engine_speed.py
+	$(BIN)/python benchmarks/randomization_cost.py
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache
