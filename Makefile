@@ -8,7 +8,7 @@ export MENAGERIE_ROOT ?= $(wildcard $(abspath ../shared/menagerie))
 # Go on with a run that an earlier, interrupted call left; start it otherwise.
 resume = $(if $(wildcard $(1)/config.yaml),--resume)
 
-.PHONY: help install demo demo-go2 test check study bench clean
+.PHONY: help install demo demo-go2 test check study bench bench-brax clean
 
 help:
 	@echo 'make install    create $(VENV) from the pinned constraints'
@@ -18,6 +18,7 @@ help:
 	@echo 'make check      ruff and mypy'
 	@echo 'make study      randomised against nominal training, several seeds (an hour; can be interrupted)'
 	@echo 'make bench      run the benchmarks'
+	@echo 'make bench-brax time to a return against Brax, in .venv-brax (an hour; can be interrupted)'
 
 install: $(STAMP)
 
@@ -51,6 +52,15 @@ study: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python benchmarks/engine_speed.py
 	$(BIN)/python benchmarks/randomization_cost.py
+
+bench-brax: .venv-brax/.installed
+	.venv-brax/bin/python benchmarks/against_brax.py
+
+.venv-brax/.installed: pyproject.toml constraints-brax.txt
+	test -x .venv-brax/bin/python || $(PYTHON) -m venv .venv-brax
+	.venv-brax/bin/python -m pip install --quiet --disable-pip-version-check -c constraints-brax.txt hatchling editables
+	.venv-brax/bin/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -c constraints-brax.txt -e .
+	@touch $@
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache
