@@ -1,6 +1,6 @@
 """Physics steps per second of the two engines on one environment, interleaved, with the time to compile.
 
-    python benchmarks/engine_speed.py [environment] [worlds]
+Run it with `python benchmarks/engine_speed.py [environment] [worlds]`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from simreal.engines import Inputs
 
 
 def program(name: str, engine: str, worlds: int, control_steps: int):
-    """A jitted scan of bare physics in `worlds` drawn worlds, and the seconds that it took to compile and run once."""
+    """A jitted scan of bare physics in drawn worlds, the seconds that its first call took, and its steps."""
     env = simreal.make(name, engine=engine)
     build = jax.jit(jax.vmap(lambda key: env.randomizer.build(env.randomizer.sample(key))))
     drawn = build(jax.random.split(jax.random.PRNGKey(0), worlds))

@@ -1,9 +1,9 @@
-"""What fresh worlds cost: environment steps/s with everything varying, against nominal worlds and a cached reset.
+"""What fresh worlds cost: steps/s where everything varies, against nominal worlds and a cached reset.
 
-Both sides have the same actuators and sensors. Actions are small noise about zero, so that episodes end by their
-time limit, staggered over the worlds.
+Both sides have the same actuators and sensors. Actions are small noise about zero, so that episodes end by
+their time limit, staggered over the worlds.
 
-    python benchmarks/randomization_cost.py [environment:engine ...]
+Run it with `python benchmarks/randomization_cost.py [environment:engine ...]`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,13 @@ import simreal
 from simreal.rollout import Rollout, RolloutState
 
 WORLDS = 512
-DEFAULT = ("go2_walk:mujoco", "arm_reach:mujoco", "arm_reach:mjx", "cartpole_swingup:mujoco", "cartpole_swingup:mjx")
+DEFAULT = (
+    "go2_walk:mujoco",
+    "arm_reach:mujoco",
+    "arm_reach:mjx",
+    "cartpole_swingup:mujoco",
+    "cartpole_swingup:mjx",
+)
 
 
 class CachedRollout(Rollout):
@@ -68,7 +74,8 @@ def compare(name: str, engine: str, pairs: int = 15) -> float:
     fresh_holder, fresh_call = caller(fresh, steps)
     fresh_holder["state"] = fresh.start(jax.random.PRNGKey(0))
     nominal_holder, nominal_call = caller(nominal, steps)
-    started = jax.jit(lambda s: Rollout.renew(nominal, s, env.randomizer.ranges))(nominal.start(jax.random.PRNGKey(0)))
+    renew = jax.jit(lambda state: Rollout.renew(nominal, state, env.randomizer.ranges))
+    started = renew(nominal.start(jax.random.PRNGKey(0)))
     nominal.first = started.replace(env=started.env.replace(steps=jnp.zeros_like(started.env.steps)))
     nominal_holder["state"] = started
     times = interleaved(fresh_call, nominal_call, pairs)

@@ -1,8 +1,8 @@
-"""Is randomisation worth it? Randomised against nominal training, several seeds, on worlds that neither has seen.
+"""Is randomisation worth it? Randomised against nominal training, on worlds that neither has seen.
 
-For each environment, way of training and seed: one `simreal train`, then one `simreal evaluate` on every set with the
-same worlds for all. Each run is a folder under `runs/study`; what is finished is not done again, and what was
-interrupted is resumed, so the command can be stopped at any time and given again.
+For each environment, way of training and seed: one `simreal train`, then one `simreal evaluate` on every set
+with the same worlds for all. Each run is a folder under `runs/study`; what is finished is not done again, and
+what was interrupted is resumed, so the command can be stopped at any time and given again.
 
     python benchmarks/randomization_study.py [environment ...]      # prints a table, in Markdown
 """
@@ -63,18 +63,17 @@ def table(environment: str, results: dict[str, list[dict]]) -> str:
         gain = paired_seed_interval(rates["train"], rates["nominal"])
         cells = [" ".join(f"{rate:.1f}" for rate in rates[way]) for way in WAYS]
         mark = " *" if gain.excludes_zero else ""
-        lines.append(
-            f"| {name} | {cells[0]} | {cells[1]} | {gain.value:+.1f} [{gain.low:+.1f}, {gain.high:+.1f}]{mark} |"
-        )
+        difference = f"{gain.value:+.1f} [{gain.low:+.1f}, {gain.high:+.1f}]{mark}"
+        lines.append(f"| {name} | {cells[0]} | {cells[1]} | {difference} |")
     held_out = {way: [100 * r["sets"]["held_out"]["success"]["rate"] for r in results[way]] for way in WAYS}
     means = {way: seed_interval(held_out[way]) for way in WAYS}
+    written = {way: f"{m.value:.1f} % [{m.low:.1f}, {m.high:.1f}]" for way, m in means.items()}
     gain = paired_seed_interval(held_out["train"], held_out["nominal"])
     verdict = "excludes zero" if gain.excludes_zero else "does NOT exclude zero"
     lines += [
         "",
-        f"held_out: randomised {means['train'].value:.1f} % [{means['train'].low:.1f}, {means['train'].high:.1f}], "
-        f"nominal {means['nominal'].value:.1f} % [{means['nominal'].low:.1f}, {means['nominal'].high:.1f}]; the "
-        f"interval of the difference {verdict}. Worlds are the same for all; * marks intervals without zero.",
+        f"held_out: randomised {written['train']}, nominal {written['nominal']}; the interval of the "
+        f"difference {verdict}. Worlds are the same for all; * marks intervals without zero.",
     ]
     return "\n".join(lines)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import ClassVar
 
 import jax
@@ -22,7 +23,8 @@ MODEL = """
   <option integrator="Euler"/>
   <visual><global offwidth="640" offheight="480"/></visual>
   <asset>
-    <texture name="grid" type="2d" builtin="checker" rgb1=".93 .94 .96" rgb2=".86 .88 .92" width="300" height="300"/>
+    <texture name="grid" type="2d" builtin="checker" rgb1=".93 .94 .96" rgb2=".86 .88 .92"
+             width="300" height="300"/>
     <texture type="skybox" builtin="gradient" rgb1=".95 .97 1" rgb2=".8 .86 .93" width="64" height="64"/>
     <material name="grid" texture="grid" texrepeat="4 4" texuniform="true"/>
   </asset>
@@ -36,7 +38,8 @@ MODEL = """
       <geom name="upper_link" type="capsule" fromto="0 0 0 1 0 0" size=".04" mass="3.0" rgba=".20 .35 .60 1"/>
       <body name="lower_link" pos="1 0 0">
         <joint name="elbow" type="hinge" axis="0 0 1" damping="0.6" armature="0.03"/>
-        <geom name="lower_link" type="capsule" fromto="0 0 0 .8 0 0" size=".03" mass="1.6" rgba=".88 .45 .12 1"/>
+        <geom name="lower_link" type="capsule" fromto="0 0 0 .8 0 0" size=".03" mass="1.6"
+              rgba=".88 .45 .12 1"/>
         <body name="tool" pos=".8 0 0">
           <geom name="tool" type="sphere" size=".035" mass="0.3" rgba=".2 .2 .25 1"/>
           <site name="tip"/>
@@ -61,10 +64,10 @@ class Reach:
 
 
 class ArmReach(Environment):
-    """Bring the tip of a 1.0 m + 0.8 m arm to a target in its plane. Action: joint torques / limits (40, 20 N m).
+    """Bring the tip of a 1.0 m + 0.8 m arm to a target in its plane. Action: joint torques / (40, 20) N m.
 
-    The arm lies in a horizontal plane that may be tilted. It has encoders and a camera that sees the tip late and
-    with noise. Success: the tip within 2 cm of the target during all of the last 0.5 s of 4.
+    The arm lies in a horizontal plane that may be tilted. It has encoders and a camera that sees the tip late
+    and with noise. Success: the tip within 2 cm of the target during all of the last 0.5 s of 4.
     """
 
     name: ClassVar[str] = "arm_reach"
@@ -98,7 +101,7 @@ class ArmReach(Environment):
     def start(self, key):
         pose_key, target_key = jax.random.split(key)
         shoulder, elbow = jax.random.uniform(pose_key, (2,), minval=jnp.array([-2.0, 0.4]), maxval=2.0)
-        # A target is the tip of a random pose: reachable, and away from the stretched and folded singularities.
+        # A target is the tip of a random pose: reachable, away from the stretched and folded singularities.
         low, high = jnp.array([-2.4, 0.4]), jnp.array([2.4, 2.4])
         target = tip(jax.random.uniform(target_key, (2,), minval=low, maxval=high))
         return jnp.stack([shoulder, elbow]), jnp.zeros(2), Reach(target, jnp.zeros((), jnp.int32))
@@ -126,7 +129,7 @@ class ArmReach(Environment):
 
     def advance(self, task: Reach, data: Data, action):
         near = jnp.linalg.norm(data.site_xpos[0, :2] - task.target) < WITHIN
-        return task.replace(steps=jnp.where(near, task.steps + 1, 0))
+        return dataclasses.replace(task, steps=jnp.where(near, task.steps + 1, 0))
 
     def reward(self, data: Data, task: Reach, action, last_action):
         distance = jnp.linalg.norm(data.site_xpos[0, :2] - task.target)

@@ -22,19 +22,22 @@ MODEL = f"""
   <option integrator="Euler"/>
   <visual><global offwidth="640" offheight="480"/></visual>
   <asset>
-    <texture name="grid" type="2d" builtin="checker" rgb1=".93 .94 .96" rgb2=".86 .88 .92" width="300" height="300"/>
+    <texture name="grid" type="2d" builtin="checker" rgb1=".93 .94 .96" rgb2=".86 .88 .92"
+             width="300" height="300"/>
     <texture type="skybox" builtin="gradient" rgb1=".95 .97 1" rgb2=".8 .86 .93" width="64" height="64"/>
     <material name="grid" texture="grid" texrepeat="6 6" texuniform="true"/>
   </asset>
   <worldbody>
     <light pos="0 -2 4" dir="0 .4 -1" directional="true"/>
     <camera name="side" pos="0 -3.2 0.15" xyaxes="1 0 0 0 0 1"/>
-    <geom name="wall" type="plane" size="6 6 .1" pos="0 1 0" quat="1 1 0 0" material="grid" contype="0" conaffinity="0"/>
+    <geom name="wall" type="plane" size="6 6 .1" pos="0 1 0" quat="1 1 0 0" material="grid"
+          contype="0" conaffinity="0"/>
     <geom name="rail" type="capsule" fromto="-{RAIL} 0 0 {RAIL} 0 0" size=".02" rgba=".35 .38 .45 1"
           contype="0" conaffinity="0"/>
     <body name="cart">
       <joint name="slider" type="slide" axis="1 0 0" damping="0.5"/>
-      <geom name="cart" type="box" size=".12 .08 .06" mass="1.0" rgba=".20 .35 .60 1" contype="0" conaffinity="0"/>
+      <geom name="cart" type="box" size=".12 .08 .06" mass="1.0" rgba=".20 .35 .60 1"
+            contype="0" conaffinity="0"/>
       <body name="pole">
         <joint name="hinge" type="hinge" axis="0 1 0" damping="0.002"/>
         <geom name="pole" type="capsule" fromto="0 0 0 0 0 .7" size=".022" mass="0.25" rgba=".88 .45 .12 1"
@@ -59,8 +62,8 @@ class Held:
 class CartpoleSwingup(Environment):
     """Swing the pole up and hold it. Action: motor force as a share of 12 N.
 
-    Success: upright within 10 degrees, on the rail, during all of the last 2 s of 10. The episode fails where the
-    cart leaves the rail.
+    Success: upright within 10 degrees, on the rail, during all of the last 2 s of 10. The episode fails where
+    the cart leaves the rail.
     """
 
     name: ClassVar[str] = "cartpole_swingup"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import ClassVar
 
@@ -58,8 +59,9 @@ class Walk:
 class Go2Walk(Environment):
     """Walk forward at 0.3 to 0.8 m/s. Action: joint targets about the home pose, +-0.3 rad, at 50 Hz.
 
-    Observations are what the real robot has: gyro, gravity direction from the IMU, encoders, the last action and
-    the command. Success: mean forward speed within 20 % of the command over the last 8 of 10 s, without a fall.
+    Observations are what the real robot has: gyro, gravity direction from the IMU, encoders, the last action
+    and the command. Success: mean forward speed within 20 % of the command over the last 8 of 10 s, without a
+    fall.
     Settings and reward follow a prototype measured for this project; joint targets, observations and air-time
     reward are those of Rudin et al. 2022.
     """
@@ -159,7 +161,8 @@ class Go2Walk(Environment):
         air_time = task.air_time + self.control_dt
         steps = task.steps + 1
         counts = steps * self.control_dt > SETTLE
-        return task.replace(
+        return dataclasses.replace(
+            task,
             air_time=jnp.where(contact, 0, air_time),
             landed=jnp.where(contact & (task.air_time > 0), air_time, 0),
             steps=steps,

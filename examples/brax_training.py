@@ -1,7 +1,7 @@
 """An unmodified Brax training function on a simreal environment.
 
-Brax's augmented random search runs on every JAX that simreal does; Brax's PPO and SAC call an API that JAX 0.10
-removed. Run it with `python examples/brax_training.py`.
+Brax's augmented random search runs on every JAX that simreal does; Brax's PPO and SAC call an API that
+JAX 0.10 removed. Run it with `python examples/brax_training.py`.
 """
 
 import functools

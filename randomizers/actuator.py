@@ -66,5 +66,5 @@ def correlation_time(*actuators: str) -> Target:
 
 
 def period_jitter() -> Target:
-    """Mean extra length of each control period, as a fraction of it, drawn anew from an exponential each time."""
+    """Mean extra length of each control period, as a share of it; each is drawn from an exponential."""
     return target("actuator", "period_jitter")

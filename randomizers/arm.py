@@ -9,7 +9,8 @@ from simreal.worldsets import NOMINAL, held_out, stand_in
 from simreal.worldsets import TRAIN as TRAIN_SET
 
 TRAIN = Randomizer(
-    # Dactyl (OpenAI 2018): masses x 0.5 to 1.5, damping x log-uniform 0.3 to 3. Peng et al. 2018: masses x 0.25 to 4.
+    # Dactyl (OpenAI 2018): masses x 0.5 to 1.5, damping x log-uniform 0.3 to 3.
+    # Peng et al. 2018: masses x 0.25 to 4.
     link_mass=physics.body_mass("upper_link", "lower_link").times(Uniform(0.7, 1.3)).each(),
     payload=physics.body_mass("tool").plus(Uniform(0.0, 0.8)),
     joint_damping=physics.joint_damping("*").times(LogUniform(0.4, 2.5)).each(),

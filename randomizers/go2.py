@@ -11,7 +11,8 @@ from simreal.worldsets import TRAIN as TRAIN_SET
 _FEET = ("FL", "FR", "RL", "RR")
 
 TRAIN = Randomizer(
-    # Link masses 80-120 %, motor strength 80-120 %, latency 0-40 ms, contact friction 0.5-1.25: Tan et al. 2018.
+    # Tan et al. 2018: link masses 80-120 %, motor strength 80-120 %, latency 0-40 ms, contact friction
+    # 0.5-1.25, IMU bias +-0.05 rad.
     link_mass=physics.body_mass("*_hip", "*_thigh", "*_calf").times(Uniform(0.85, 1.15)),
     trunk_mass=physics.body_mass("base").times(Uniform(0.85, 1.15)),
     payload=physics.body_mass("base").plus(Uniform(-1.0, 2.0)),  # RMA (Kumar et al. 2021) trains 0 to 6 kg
@@ -28,7 +29,7 @@ TRAIN = Randomizer(
     velocity_noise=sensor.noise("joint_velocity").set(Uniform(0.0, 0.5)),
     gyro_noise=sensor.noise("gyro").set(Uniform(0.0, 0.1)),
     gravity_noise=sensor.noise("gravity").set(Uniform(0.0, 0.03)),
-    gravity_bias=sensor.bias("gravity").set(Uniform(-0.03, 0.03)).each(),  # IMU bias +-0.05 rad: Tan et al. 2018
+    gravity_bias=sensor.bias("gravity").set(Uniform(-0.03, 0.03)).each(),
     imu_delay=sensor.delay("gyro", "gravity").set(Uniform(0.0, 0.01)),
     push_rate=disturbance.push_rate("base").set(Uniform(0.0, 0.3)),
     push_impulse=disturbance.push_impulse("base").set(Uniform(0.0, 6.0)),  # up to 0.4 m/s

@@ -1,8 +1,10 @@
-"""What can vary in the physics. Elements are addressed by their names in the model, or by patterns over them.
+"""What can vary in the physics.
 
     body_mass("pole").times(LogUniform(0.7, 1.4))      # one draw for all addressed elements
     kp("*").times(Uniform(0.95, 1.05)).each()          # one draw for each motor
     friction("floor").set(Uniform(0.2, 0.4)).at(Uniform(2, 8))   # slips in mid-episode
+
+Elements are addressed by their names in the model, or by patterns over them.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ _LAZY = {
     "register": "simreal.registry",
 }
 
-__all__ = ["Environment", "Randomizer", "State", "UserError", "World", "load_policy", "make", "__version__"]
+__all__ = ["Environment", "Randomizer", "State", "UserError", "World", "__version__", "load_policy", "make"]
 
 
 def __getattr__(name: str) -> Any:

@@ -20,8 +20,8 @@ class BraxEnv(base.Env):
     """Wraps an environment; `reset` draws a World each time it is called.
 
     `done` reports failure only: Brax's own `EpisodeWrapper` keeps the time, so train with
-    `episode_length=env.episode_steps`. Brax's `AutoResetWrapper` starts every later episode from the first one's
-    state, and so in the first one's World; simreal's own rollout does not.
+    `episode_length=env.episode_steps`. Brax's `AutoResetWrapper` starts every later episode from the first
+    one's state, and so in the first one's World; simreal's own rollout does not.
 
     Args:
         env: the simreal environment.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from pydantic import ValidationError
 
 from simreal.config import RUN_CONFIG, RunConfig
 from simreal.config_keys import config_keys, nearest_key
-from simreal.errors import UserError
+from simreal.errors import UserError, nearest
 
 SHIPPED = Path(__file__).parent / "configs"
 
@@ -86,10 +85,8 @@ def find_config(source: str | Path) -> Path:
         return path
     if path.suffix in {".yaml", ".yml"} or len(path.parts) > 1:
         raise UserError(f"no configuration file '{source}'")
-    close = difflib.get_close_matches(str(source), shipped, n=1)
-    hint = f"did you mean '{close[0]}'? " if close else ""
     raise UserError(
-        f"no configuration '{source}'; {hint}valid: {', '.join(shipped)}, or the path of a YAML file"
+        f"no configuration '{source}'; {nearest(str(source), shipped)}, or the path of a YAML file"
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import json
 from collections.abc import Iterator, Sequence
 from types import NoneType, UnionType
@@ -12,6 +11,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 from pydantic.fields import FieldInfo
 
 from simreal.config import RunConfig
+from simreal.errors import closest
 
 
 class Key(NamedTuple):
@@ -36,9 +36,8 @@ def nearest_key(place: str, own: Sequence[str] = ()) -> str:
     beside = {name.rpartition(".")[2]: name for name in config_keys() if name.rpartition(".")[0] == section}
     top = {} if section else {name: name for name in (*_sections(), *(item.strip("-") for item in own))}
     for choices in ({leaf: by_leaf[leaf]} if leaf in by_leaf else {}, beside | top, by_leaf):
-        close = difflib.get_close_matches(leaf, choices, n=1)
-        if close:
-            return f"; did you mean '{'--' if own else ''}{choices[close[0]]}'?"
+        if meant := closest(leaf, choices):
+            return f"; did you mean '{'--' if own else ''}{choices[meant]}'?"
     return f"; valid: {', '.join(beside | top or dict.fromkeys(_sections()))}"
 
 

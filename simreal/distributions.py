@@ -11,6 +11,7 @@ import abc
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -51,8 +52,8 @@ class Distribution(abc.ABC):
     def quantile(self, u: jax.Array, p: Parameters) -> jax.Array:
         """The draws that uniform numbers `u` in (0, 1) stand for: the inverse of the cumulative distribution.
 
-        Drawing by quantiles makes all factors of a World from one call of the random generator, and any design of
-        the unit cube (Sobol, Latin hypercube) usable as a set of worlds.
+        Drawing by quantiles makes all factors of a World from one call of the random generator, and any
+        design of the unit cube (Sobol, Latin hypercube) usable as a set of worlds.
         """
 
     @abc.abstractmethod
@@ -78,7 +79,7 @@ class Distribution(abc.ABC):
         raise NotImplementedError
 
 
-def _scipy_stats():
+def _scipy_stats() -> Any:
     from scipy import stats  # half a second to import, and only tests and coverage checks need it
 
     return stats
@@ -101,16 +102,16 @@ class Uniform(Distribution):
         if self.low > self.high:
             raise ValueError(f"low {self.low} is above high {self.high}")
 
-    def quantile(self, u, p):
+    def quantile(self, u: jax.Array, p: Parameters) -> jax.Array:
         return p["low"] + (p["high"] - p["low"]) * u
 
-    def normalize(self, x, p):
+    def normalize(self, x: jax.Array, p: Parameters) -> jax.Array:
         return _from_unit(x, p["low"], p["high"])
 
-    def support(self):
+    def support(self) -> tuple[float, float]:
         return self.low, self.high
 
-    def cdf(self, x):
+    def cdf(self, x: np.ndarray) -> np.ndarray:
         return _scipy_stats().uniform.cdf(x, self.low, self.high - self.low)
 
 
@@ -127,18 +128,18 @@ class LogUniform(Distribution):
         if self.low <= 0:
             raise ValueError(f"a log-uniform range must be above 0, got low {self.low}")
 
-    def quantile(self, u, p):
+    def quantile(self, u: jax.Array, p: Parameters) -> jax.Array:
         low = jnp.log(p["low"])
         return jnp.exp(low + (jnp.log(p["high"]) - low) * u)
 
-    def normalize(self, x, p):
+    def normalize(self, x: jax.Array, p: Parameters) -> jax.Array:
         low = p["low"]
         return _from_unit(jnp.log(jnp.maximum(x, low * 1e-6)), jnp.log(low), jnp.log(p["high"]))
 
-    def support(self):
+    def support(self) -> tuple[float, float]:
         return self.low, self.high
 
-    def cdf(self, x):
+    def cdf(self, x: np.ndarray) -> np.ndarray:
         return _scipy_stats().loguniform.cdf(x, self.low, self.high)
 
 
@@ -153,22 +154,22 @@ class Normal(Distribution):
         if self.sd < 0:
             raise ValueError(f"sd {self.sd} is negative")
 
-    def quantile(self, u, p):
+    def quantile(self, u: jax.Array, p: Parameters) -> jax.Array:
         return p["mean"] + p["sd"] * ndtri(u)
 
-    def normalize(self, x, p):
+    def normalize(self, x: jax.Array, p: Parameters) -> jax.Array:
         return _from_unit(x, p["mean"] - 3 * p["sd"], p["mean"] + 3 * p["sd"])
 
-    def support(self):
+    def support(self) -> tuple[float, float]:
         if self.sd == 0:
             return self.mean, self.mean
         return -math.inf, math.inf
 
-    def _central(self):
+    def _central(self) -> tuple[float, float]:
         low, high = _scipy_stats().norm.interval(CENTRAL_MASS, self.mean, self.sd)
         return float(low), float(high)
 
-    def cdf(self, x):
+    def cdf(self, x: np.ndarray) -> np.ndarray:
         return _scipy_stats().norm.cdf(x, self.mean, self.sd)
 
 
@@ -187,18 +188,18 @@ class TruncatedNormal(Distribution):
         if self.low > self.high:
             raise ValueError(f"low {self.low} is above high {self.high}")
 
-    def quantile(self, u, p):
+    def quantile(self, u: jax.Array, p: Parameters) -> jax.Array:
         low, high = ndtr((p["low"] - p["mean"]) / p["sd"]), ndtr((p["high"] - p["mean"]) / p["sd"])
         draw = p["mean"] + p["sd"] * ndtri(low + (high - low) * u)
         return jnp.clip(draw, p["low"], p["high"])
 
-    def normalize(self, x, p):
+    def normalize(self, x: jax.Array, p: Parameters) -> jax.Array:
         return _from_unit(x, p["low"], p["high"])
 
-    def support(self):
+    def support(self) -> tuple[float, float]:
         return self.low, self.high
 
-    def cdf(self, x):
+    def cdf(self, x: np.ndarray) -> np.ndarray:
         low, high = (self.low - self.mean) / self.sd, (self.high - self.mean) / self.sd
         return _scipy_stats().truncnorm.cdf(x, low, high, self.mean, self.sd)
 
@@ -218,7 +219,7 @@ class Beta(Distribution):
         if self.low > self.high:
             raise ValueError(f"low {self.low} is above high {self.high}")
 
-    def quantile(self, u, p):
+    def quantile(self, u: jax.Array, p: Parameters) -> jax.Array:
         def halve(_: int, bracket: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             low, high = bracket
             middle = (low + high) / 2
@@ -229,13 +230,13 @@ class Beta(Distribution):
         low, high = jax.lax.fori_loop(0, 30, halve, bracket)
         return p["low"] + (p["high"] - p["low"]) * (low + high) / 2
 
-    def normalize(self, x, p):
+    def normalize(self, x: jax.Array, p: Parameters) -> jax.Array:
         return _from_unit(x, p["low"], p["high"])
 
-    def support(self):
+    def support(self) -> tuple[float, float]:
         return self.low, self.high
 
-    def cdf(self, x):
+    def cdf(self, x: np.ndarray) -> np.ndarray:
         return _scipy_stats().beta.cdf(x, self.a, self.b, self.low, self.high - self.low)
 
 
@@ -264,17 +265,17 @@ class Choice(Distribution):
     def continuous(self) -> bool:
         return False
 
-    def quantile(self, u, p):
+    def quantile(self, u: jax.Array, p: Parameters) -> jax.Array:
         edges = jnp.cumsum(p["weights"]) / jnp.sum(p["weights"])
         index = jnp.sum(u[..., None] > edges.reshape((1,) * u.ndim + (-1,)), axis=-1)
         return p["values"][jnp.minimum(index, edges.shape[0] - 1)]
 
-    def normalize(self, x, p):
+    def normalize(self, x: jax.Array, p: Parameters) -> jax.Array:
         return _from_unit(x, jnp.min(p["values"]), jnp.max(p["values"]))
 
-    def support(self):
+    def support(self) -> tuple[float, float]:
         return min(self.values), max(self.values)
 
-    def cdf(self, x):
+    def cdf(self, x: np.ndarray) -> np.ndarray:
         values, weights = np.asarray(self.values), np.asarray(self.weights) / sum(self.weights)
         return np.sum(weights * (values <= np.asarray(x)[..., None]), axis=-1)

@@ -27,9 +27,9 @@ from simreal.actuators import Actuators, ActuatorState
 from simreal.disturbances import PARAMETERS as DISTURBANCES
 from simreal.disturbances import push_force
 from simreal.engines import Data, Inputs, Physics, engine_class, resolve
-from simreal.errors import UserError
+from simreal.errors import UserError, nearest
 from simreal.quantities import PARAMETER_UNITS, element_names
-from simreal.randomizer import ParameterGroup, Randomizer, Ranges, WorldBuilder, nearest
+from simreal.randomizer import ParameterGroup, Randomizer, Ranges, WorldBuilder
 from simreal.sensors import Sensors, SensorState
 from simreal.world import World
 
@@ -42,7 +42,7 @@ MAX_SPEED = 1e6
 
 @struct.dataclass
 class State:
-    """One world between two control steps. `obs`, `reward`, `done`, `metrics`, `info` are named as in Brax."""
+    """One world between two control steps; `obs`, `reward`, `done`, `metrics`, `info` as in Brax."""
 
     obs: jax.Array  # (observations,) what the policy sees
     privileged: jax.Array  # (privileged,) what only a critic may see: clean observation, true state, draws
@@ -125,7 +125,8 @@ class Environment(abc.ABC):
     def control(self, action: jax.Array) -> jax.Array:
         """Control (nu,) that an action in [-1, 1] asks for; affine. Default: the whole ctrlrange."""
         low, high = self.mj_model.actuator_ctrlrange.T
-        return jnp.asarray((low + high) / 2, action.dtype) + jnp.asarray((high - low) / 2, action.dtype) * action
+        centre, half = (jnp.asarray(x, action.dtype) for x in ((low + high) / 2, (high - low) / 2))
+        return centre + half * action
 
     def privileged(self, data: Data, task: Task) -> jax.Array:
         """What a critic may see beyond the clean observation and the world's draws."""
@@ -225,11 +226,14 @@ class Environment(abc.ABC):
             if target.quantity == "delay":
                 self.check_delay(f"factor {name!r}", bound.factor.distribution.support()[1])
             if target.quantity in ("no_load_speed", "thermal_limit") and not driven[bound.mask].all():
-                raise UserError(f"factor {name!r}: {target.quantity} needs actuators that drive a joint directly")
+                raise UserError(
+                    f"factor {name!r}: {target.quantity} needs actuators that drive a joint directly"
+                )
             if target.quantity == "backlash" and not servo[bound.mask].all():
                 wrong = self.actuators.names[int(np.flatnonzero(bound.mask & ~servo)[0])]
                 raise UserError(
-                    f"factor {name!r}: backlash is play of a position command; {wrong!r} is no position actuator"
+                    f"factor {name!r}: backlash is play of a position command; "
+                    f"{wrong!r} is no position actuator"
                 )
 
     def check_delay(self, where: str, delay: float) -> None:
@@ -295,7 +299,7 @@ class Environment(abc.ABC):
         )
 
     def step(self, state: State, action: jax.Array) -> State:
-        """One control step. An action outside [-1, 1] is clipped; a state that is done steps on regardless."""
+        """One control step. An action is clipped to [-1, 1]; a state that is done steps on regardless."""
         key, actuator_key, period_key, push_key, sensor_key = jax.random.split(state.key, 5)
         action = jnp.clip(action.astype(state.action.dtype), -1, 1)
         now = state.world.at(state.physics.time)
@@ -356,11 +360,12 @@ class Environment(abc.ABC):
 
     def _force_limit(self, world: World) -> jax.Array:
         """(nu,) largest force of each actuator; infinite where nothing limits it."""
-        limited = self.mj_model.actuator_forcelimited.astype(bool)
-        forcerange = world.model.get("actuator_forcerange", jnp.asarray(self.mj_model.actuator_forcerange, float))
-        direct = (self.mj_model.actuator_biastype == 0) & self.mj_model.actuator_ctrllimited.astype(bool)
-        gain = world.model.get("actuator_gainprm", jnp.asarray(self.mj_model.actuator_gainprm, float))[:, 0]
-        by_control = jnp.abs(gain) * jnp.asarray(np.abs(self.mj_model.actuator_ctrlrange).max(axis=1), gain.dtype)
+        model = self.mj_model
+        limited = model.actuator_forcelimited.astype(bool)
+        forcerange = world.model.get("actuator_forcerange", jnp.asarray(model.actuator_forcerange, float))
+        direct = (model.actuator_biastype == 0) & model.actuator_ctrllimited.astype(bool)
+        gain = world.model.get("actuator_gainprm", jnp.asarray(model.actuator_gainprm, float))[:, 0]
+        by_control = jnp.abs(gain) * jnp.asarray(np.abs(model.actuator_ctrlrange).max(axis=1), gain.dtype)
         unlimited = jnp.where(direct, by_control, jnp.inf)
         return jnp.where(limited, forcerange[:, 1], unlimited)
 
@@ -394,7 +399,7 @@ class Environment(abc.ABC):
 
     def replace(self, **options: Any) -> Environment:
         """The same task on another engine or randomizer."""
-        current = {"engine": self.engine_name, "randomizer": self.randomizer.randomizer}
+        current: dict[str, Any] = {"engine": self.engine_name, "randomizer": self.randomizer.randomizer}
         return type(self)(**(current | options))
 
 

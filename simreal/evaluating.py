@@ -154,7 +154,7 @@ def evaluate_run(request: Request, note: Note = lambda text: None) -> Evaluation
 
 
 def _film(request: Request, evaluation: Evaluation, note: Note) -> Path | None:
-    """An episode in a world of the `train` set, as an animation for the report; None where none is wanted or can be.
+    """An episode in a world of the `train` set, as an animation for the report; None where there can be none.
 
     The episode is the one whose return is the median of the set: typical, not the best.
     """

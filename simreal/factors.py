@@ -70,7 +70,7 @@ class Factor:
     independent: bool = False
     """False: one draw for all addressed elements. True: one draw for each of them."""
     time: Distribution | None = field(default=None)
-    """Drawn time (s) of the episode at which the value jumps from nominal to the draw; None: from the start."""
+    """Drawn time (s) of the episode when the value jumps from nominal to the draw; None: from the start."""
 
     def each(self) -> Factor:
         """Draws a value of its own for each addressed element."""
@@ -87,6 +87,8 @@ class Factor:
         return text if self.time is None else f"{text}.at({self.time})"
 
 
-def target(group: Group, quantity: str, patterns: tuple[str, ...] = ("*",), **options) -> Target:
+def target(
+    group: Group, quantity: str, patterns: tuple[str, ...] = ("*",), **options: str | bool | int
+) -> Target:
     """Short form for the vocabularies in `simreal.randomizers`."""
     return Target(group, quantity, patterns or ("*",), tuple(sorted(options.items())))

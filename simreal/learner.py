@@ -1,11 +1,13 @@
 """PPO from Brax's parts: its networks, loss, advantage estimate, normaliser and action distribution.
 
-The loop is ours. One iteration is two programs: `collect` steps the worlds (and alone contains calls to the host,
-which JAX never caches on disk), `update` learns from what they did. Everything that a run is lies in one pytree.
+The loop is ours. One iteration is two programs: `collect` steps the worlds (and alone contains calls to the
+host, which JAX never caches on disk), `update` learns from what they did. Everything that a run is lies in
+one pytree.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Mapping
 from typing import Any
@@ -110,8 +112,9 @@ class Learner:
             key=key,
             steps=jnp.zeros((), jnp.uint32),
         )
-        # A copy of each leaf: `epoch` donates them, and a buffer that two leaves share can only be given once. The
-        # explicit type takes away weak types, for which the first epoch would compile a program of its own.
+        # A copy of each leaf: `epoch` donates them, and a buffer that two leaves share can only be given
+        # once. The explicit type takes away weak types, for which the first epoch would compile a program of
+        # its own.
         return jax.tree.map(lambda x: jnp.array(x, dtype=jnp.result_type(x)), state)
 
     def epoch(self, state: TrainingState) -> tuple[TrainingState, Metrics]:
@@ -128,7 +131,8 @@ class Learner:
             row |= self._episodes(ended)
             last_success = _latest(state.last_success, ended, self.worlds)
             rows.append(row)
-            state = state.replace(
+            state = dataclasses.replace(
+                state,
                 params=params,
                 optimizer=optimizer_state,
                 normalizer=normalizer,
@@ -144,11 +148,13 @@ class Learner:
     def collect(
         self, rollout: RolloutState, policy: Any, normalizer: Any, ranges: Ranges, key: jax.Array
     ) -> tuple[RolloutState, types.Transition, Ended]:
-        """`unroll_length` control steps of all worlds; the data of the learning worlds has leaves (T, B, ...)."""
+        """`unroll_length` control steps of all worlds; the learning worlds' data has leaves (T, B, ...)."""
         distribution = self.networks.parametric_action_distribution
         learning = self.worlds
 
-        def one_step(state: RolloutState, key: jax.Array):
+        def one_step(
+            state: RolloutState, key: jax.Array
+        ) -> tuple[RolloutState, tuple[types.Transition, Ended]]:
             state = self.rollout.renew(state, ranges)
             seen = {"state": state.env.obs, "privileged_state": state.env.privileged}
             logits = self.networks.policy_network.apply(normalizer, policy, seen)
@@ -184,7 +190,9 @@ class Learner:
 
     # -- update --------------------------------------------------------------------------------------------
 
-    def update(self, params: Any, optimizer_state: Any, normalizer: Any, data: types.Transition, key: jax.Array):
+    def update(
+        self, params: Any, optimizer_state: Any, normalizer: Any, data: types.Transition, key: jax.Array
+    ) -> tuple[Any, Any, Any, Metrics]:
         """`epochs` passes of minibatch gradient steps over the collected data."""
         hyper = self.config.learner
         old_values = self.networks.value_network.apply(normalizer, params.value, data.observation)
@@ -193,10 +201,13 @@ class Learner:
         # To (B, T, ...): a minibatch is some worlds over the whole unroll, for the advantage estimate.
         data = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data)
 
-        def gradient_step(carry: tuple[Any, Any], batch: tuple[types.Transition, jax.Array]):
+        def gradient_step(
+            carry: tuple[Any, Any], batch: tuple[types.Transition, jax.Array]
+        ) -> tuple[tuple[Any, Any], Metrics]:
             params, optimizer_state = carry
             minibatch, key = batch
-            (_, metrics), gradient = jax.value_and_grad(self.loss, has_aux=True)(params, normalizer, minibatch, key)
+            gradient_of = jax.value_and_grad(self.loss, has_aux=True)
+            (_, metrics), gradient = gradient_of(params, normalizer, minibatch, key)
             rate = jnp.asarray(hyper.learning_rate)
             if hyper.adaptive_kl is not None:
                 optimizer_state, rate = optimizer.adaptive_kl_learning_rate(
@@ -217,18 +228,20 @@ class Learner:
             )
             return kept, {**metrics, "learning_rate": rate, "skipped_updates": 1.0 - fine}
 
-        def one_pass(carry: tuple[Any, Any], key: jax.Array):
+        def one_pass(carry: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Metrics]:
             order_key, loss_key = jax.random.split(key)
             order = jax.random.permutation(order_key, self.worlds)
 
             def split(x: jax.Array) -> jax.Array:
-                return x[order].reshape((hyper.minibatches, -1) + x.shape[1:])
+                return x[order].reshape(hyper.minibatches, -1, *x.shape[1:])
 
             keys = jax.random.split(loss_key, hyper.minibatches)
             return jax.lax.scan(gradient_step, carry, (jax.tree.map(split, data), keys))
 
-        carry = (params, optimizer_state)
-        (params, optimizer_state), metrics = jax.lax.scan(one_pass, carry, jax.random.split(key, hyper.epochs))
+        learnt, metrics = jax.lax.scan(
+            one_pass, (params, optimizer_state), jax.random.split(key, hyper.epochs)
+        )
+        params, optimizer_state = learnt
         # After the passes: the old distribution parameters stay comparable for the divergence.
         normalizer = running_statistics.update(normalizer, observation, std_min_value=_SD_FLOOR)
         skipped = jnp.sum(metrics.pop("skipped_updates"))

@@ -12,9 +12,16 @@ from simreal.config import LearnerConfig, NetworkConfig
 
 
 def make_networks(
-    observation_size: int, privileged_size: int, action_size: int, network: NetworkConfig, learner: LearnerConfig
+    observation_size: int,
+    privileged_size: int,
+    action_size: int,
+    network: NetworkConfig,
+    learner: LearnerConfig,
 ) -> ppo_networks.PPONetworks:
-    """Policy on "state", critic on "privileged_state"; a normal distribution with a learnt, state-free deviation."""
+    """Policy on "state", critic on "privileged_state".
+
+    The action distribution is normal, with a learnt deviation that does not depend on the state.
+    """
     sizes = {"state": (observation_size,), "privileged_state": (privileged_size,)}
 
     def preprocess(observation: Any, statistics: Any) -> Any:

@@ -43,8 +43,8 @@ class PolicyInterface:
 class Policy:
     """Maps observations to actions. Callable as `action, memory = policy(obs, memory, key)`.
 
-    Takes NumPy arrays, or JAX arrays inside a jitted function, with any leading axes; returns the mean action, so
-    `key` is not used. `memory` is `()`: this policy has none.
+    Takes NumPy arrays, or JAX arrays inside a jitted function, with any leading axes; returns the mean
+    action, so `key` is not used. `memory` is `()`: this policy has none.
     """
 
     def __init__(self, interface: PolicyInterface, weights: Mapping[str, np.ndarray]) -> None:
@@ -83,6 +83,7 @@ class Policy:
         weights["std"] = np.asarray(normalizer.std["state"])
         zero = np.zeros(env.action_size, np.float32)
         offset = np.asarray(env.control(zero))
+        learner = config.learner
         interface = PolicyInterface(
             environment=env.name,
             control_dt=env.control_dt,
@@ -91,7 +92,7 @@ class Policy:
             control_offset=offset.tolist(),
             control_scale=(np.asarray(env.control(zero + 1)) - offset).tolist(),
             activation=config.network.activation,
-            observation_clip=config.learner.observation_clip if config.learner.normalize_observations else None,
+            observation_clip=learner.observation_clip if learner.normalize_observations else None,
         )
         return cls(interface, weights)
 

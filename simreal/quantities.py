@@ -1,7 +1,8 @@
 """The typed table of physical quantities that may vary: which elements, which model fields, which limits.
 
 Each entry turns nominal model fields into varied ones for one world. What must be recomputed afterwards
-follows from the fields (`simreal.constants`). `simreal.randomizers.physics` is the vocabulary over this table.
+follows from the fields (`simreal.constants`). `simreal.randomizers.physics` is the vocabulary over this
+table.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ def _gravity(fields: Fields, change: Change, options: dict[str, Any]) -> Fields:
 
 
 def _gravity_tilt(fields: Fields, change: Change, options: dict[str, Any]) -> Fields:
-    """Turns gravity about a horizontal axis: a floor tilted by that angle, with the frame that of the floor."""
+    """Turns gravity about a horizontal axis: a floor tilted by that angle, seen in the floor's frame."""
     angle = change(jnp.zeros(1, fields["opt.gravity"].dtype))[0]
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     x, y, z = fields["opt.gravity"]

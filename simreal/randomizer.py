@@ -1,7 +1,7 @@
 """Named factors, and how their draws become a World.
 
-`Randomizer` is written by hand, beside an environment, without a model at hand. Binding it to an environment's
-model checks every name and range and gives a `WorldBuilder`, whose two steps are
+`Randomizer` is written by hand, beside an environment, without a model at hand. Binding it to an
+environment's model checks every name and range and gives a `WorldBuilder`, whose two steps are
 
     draws = builder.sample(key, ranges)     # from what
     world = builder.build(draws)            # what it means for the model, actuators, sensors
@@ -11,11 +11,10 @@ The structure is static; `builder.ranges` is a pytree of arrays that may be trac
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -26,8 +25,8 @@ import numpy as np
 from simreal import world as world_module
 from simreal.constants import derived_constants
 from simreal.distributions import Distribution, LogUniform, Uniform
-from simreal.errors import UserError
-from simreal.factors import OPERATIONS, Factor
+from simreal.errors import UserError, nearest
+from simreal.factors import OPERATIONS, Factor, Target
 from simreal.quantities import QUANTITIES, element_names, nominal_field
 from simreal.world import World
 
@@ -67,7 +66,7 @@ class Randomizer:
                 distribution: Distribution = kind(low, high)
             except (TypeError, ValueError) as error:
                 raise UserError(f"{where}.{name}: {error}; a range is [low, high]") from None
-            changed[name] = Factor(factor.target, factor.operation, distribution, factor.independent, factor.time)
+            changed[name] = replace(factor, distribution=distribution)
         return self.replace(**changed)
 
     @property
@@ -96,13 +95,6 @@ def _open_unit(key: jax.Array) -> jax.Array:
     """Uniform in (0, 1) without its ends, whose quantiles may be infinite."""
     dtype = jnp.result_type(float)
     return jax.random.uniform(key, (), dtype, minval=jnp.finfo(dtype).epsneg / 2, maxval=1)
-
-
-def nearest(name: str, valid: Collection[str]) -> str:
-    """The end of an error message: what was meant, perhaps, and what would be valid."""
-    close = difflib.get_close_matches(name, list(valid), n=1)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    return f"{hint}valid: {', '.join(valid) or 'none'}"
 
 
 @dataclass(frozen=True)
@@ -137,7 +129,7 @@ class Bound:
 
 @dataclass(frozen=True)
 class ParameterGroup:
-    """Parameters of actuators, sensors or disturbances: names of their elements, and values without effect."""
+    """Parameters of actuators, sensors or disturbances, whose elements bear these names."""
 
     elements: tuple[str, ...]
     nominal: Mapping[str, np.ndarray]
@@ -268,11 +260,14 @@ class WorldBuilder:
             variant=jnp.zeros((), jnp.int32),
         )
 
-    def _stage(self, draws: Draws, happened: jax.Array):
+    def _stage(
+        self, draws: Draws, happened: jax.Array
+    ) -> tuple[dict[str, jax.Array], dict[str, dict[str, jax.Array]], jax.Array]:
         """Fields and parameters with the events `happened` (events,) applied."""
         fields = {name: jnp.asarray(value, dtype=float) for name, value in self._nominal.items()}
         parameters: dict[str, dict[str, jax.Array]] = {
-            group: {k: jnp.asarray(v, dtype=float) for k, v in g.nominal.items()} for group, g in self.groups.items()
+            name: {k: jnp.asarray(v, dtype=float) for k, v in group.nominal.items()}
+            for name, group in self.groups.items()
         }
         for name, bound in self.bound.items():
             draw = draws[name]
@@ -301,14 +296,16 @@ class WorldBuilder:
                 raise UserError(f"{where}: unknown quantity; {nearest(target.quantity, QUANTITIES)}")
             quantity = QUANTITIES[target.quantity]
             names = element_names(model, quantity.element)
-            unit, lowest, strict, operations = quantity.unit, quantity.lowest, quantity.strict, quantity.operations
-            values = self._physical_values(model, target, names)
+            unit, lowest, strict = quantity.unit, quantity.lowest, quantity.strict
+            operations = quantity.operations
+            values = self._physical_values(model, target)
         else:
             group = self.groups[target.group]
             if target.quantity not in group.nominal:
                 raise UserError(f"{where}: unknown quantity; {nearest(target.quantity, group.nominal)}")
             names, unit = list(group.elements), group.units.get(target.quantity, "")
-            lowest, strict, operations = (-math.inf if target.quantity == "bias" else 0.0), False, tuple(OPERATIONS)
+            operations = tuple(OPERATIONS)
+            lowest, strict = -math.inf if target.quantity == "bias" else 0.0, False
             values = np.asarray(group.nominal[target.quantity]).reshape(-1)
             if values.size == 1 and len(names) != 1:
                 names = ["*"]
@@ -327,7 +324,7 @@ class WorldBuilder:
         )
 
     @staticmethod
-    def _physical_values(model: mujoco.MjModel, target, names: list[str]) -> np.ndarray:
+    def _physical_values(model: mujoco.MjModel, target: Target) -> np.ndarray:
         """The nominal value that the operation changes, one per row, for the support check."""
         quantity = QUANTITIES[target.quantity]
         options = dict(target.options)
@@ -348,8 +345,9 @@ def _valid_names(names: list[str]) -> list[str]:
 def _check_support(where: str, factor: Factor, nominal: np.ndarray, lowest: float, strict: bool) -> None:
     """Raises UserError where some draw would make a value impossible."""
     low, high = factor.distribution.support()
-    if factor.time is not None and factor.time.support()[0] < 0:
-        raise UserError(f"{where}: the event's time may be {factor.time.support()[0]:g} s; it must be at least 0")
+    earliest = factor.time.support()[0] if factor.time is not None else 0.0
+    if earliest < 0:
+        raise UserError(f"{where}: the event's time may be {earliest:g} s; it must be at least 0")
     if factor.operation == "times":
         extreme = min(float(np.min(nominal * low)), float(np.min(nominal * high)))
         if np.all(nominal == 0):

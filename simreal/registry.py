@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from simreal.errors import UserError
+from simreal.errors import UserError, nearest
 
 if TYPE_CHECKING:
     from simreal.environment import Environment
@@ -30,8 +30,6 @@ def environment_class(name: str) -> type[Environment]:
         UserError: an unknown name.
     """
     if name not in ENVIRONMENTS:
-        from simreal.randomizer import nearest
-
         raise UserError(f"environment: {name!r} is unknown; {nearest(name, ENVIRONMENTS)}")
     module, _, attribute = ENVIRONMENTS[name].partition(":")
     return getattr(importlib.import_module(module), attribute)

@@ -1,11 +1,13 @@
 """B worlds side by side, each episode in a world of its own.
 
-A reset is expensive beside a step (a World is built, its derived constants computed), so its cost follows the
-number of episodes that end: at most `capacity` worlds are reset in one pass, and passes repeat while any wait.
+A reset is expensive beside a step (a World is built, its derived constants computed), so its cost follows
+the number of episodes that end: at most `capacity` worlds are reset in one pass, and passes repeat while any
+wait.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 
@@ -72,7 +74,7 @@ class Rollout:
         """B worlds that wait for their first reset, which the first `renew` gives them."""
         shape = jax.eval_shape(self.env.reset, key)
         env = jax.tree.map(lambda leaf: jnp.zeros((self.worlds, *leaf.shape), leaf.dtype), shape)
-        env = env.replace(key=jax.random.split(key, self.worlds), done=jnp.ones_like(env.done))
+        env = dataclasses.replace(env, key=jax.random.split(key, self.worlds), done=jnp.ones_like(env.done))
         no = jnp.zeros(self.worlds, bool)
         return RolloutState(env, jnp.zeros_like(env.reward), started=no, counted=no)
 
@@ -98,7 +100,7 @@ class Rollout:
         env = self.env.reset(start_key, world=self.draw_world(world_key, ranges))
         counted = started | (not self.stagger)
         age = jax.random.randint(jax.random.fold_in(key, _STAGGER), (), 0, self.env.episode_steps)
-        env = env.replace(steps=jnp.where(counted, env.steps, age))
+        env = dataclasses.replace(env, steps=jnp.where(counted, env.steps, age))
         return RolloutState(env, jnp.zeros_like(env.reward), started=jnp.ones((), bool), counted=counted)
 
     def step(self, state: RolloutState, action: jax.Array) -> tuple[RolloutState, Ended]:
@@ -117,4 +119,4 @@ class Rollout:
             success=env.info["success"],
             diverged=env.info["diverged"],
         )
-        return state.replace(env=env, episode_return=episode_return), ended
+        return dataclasses.replace(state, env=env, episode_return=episode_return), ended

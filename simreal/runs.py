@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib.metadata
 import json
 import math
@@ -19,7 +18,7 @@ from typing import Any
 
 from simreal.config import RunConfig
 from simreal.config_files import build_config, read_yaml, to_yaml
-from simreal.errors import UserError
+from simreal.errors import UserError, closest
 
 RUNS = Path("runs")
 PACKAGES = ("simreal", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "numpy")
@@ -90,8 +89,8 @@ class Run:
         run = cls(folder)
         if not run.config_file.is_file():
             beside = [str(path.parent) for path in sorted(folder.parent.glob("*/config.yaml"))]
-            close = difflib.get_close_matches(str(folder), beside, n=1)
-            hint = f"; did you mean '{close[0]}'?" if close else f"; runs beside it: {', '.join(beside)}"
+            meant = closest(str(folder), beside)
+            hint = f"; did you mean '{meant}'?" if meant else f"; runs beside it: {', '.join(beside)}"
             raise UserError(f"no run in '{folder}': it has no config.yaml{hint if beside else ''}")
         return run
 

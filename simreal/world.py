@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,9 +14,9 @@ from flax import struct
 class World:
     """The values that make one world differ from the nominal one; a plain pytree.
 
-    Where the randomizer has mid-episode events, `model`, `actuator`, `sensor`, `disturbance` and `number` have
-    a leading axis of stages (stage k: the k earliest events have happened) and `event_times` says when each
-    stage after the first begins; `at` picks the stage. Without events there is no such axis.
+    Where the randomizer has mid-episode events, `model`, `actuator`, `sensor`, `disturbance` and `number`
+    have a leading axis of stages (stage k: the k earliest events have happened) and `event_times` says when
+    each stage after the first begins; `at` picks the stage. Without events there is no such axis.
     """
 
     model: dict[str, jax.Array]
@@ -43,7 +45,8 @@ class World:
         stage = jnp.sum(time >= self.event_times)
         varying = (self.model, self.actuator, self.sensor, self.disturbance, self.number)
         model, actuator, sensor, disturbance, number = jax.tree.map(lambda x: x[stage], varying)
-        return self.replace(  # type: ignore[attr-defined]
+        return dataclasses.replace(
+            self,
             model=model,
             actuator=actuator,
             sensor=sensor,

@@ -1,22 +1,22 @@
 """Named, fixed sets of worlds for the evaluator.
 
 A set is written down beside its environment before anything is trained, is drawn from its own seed, and is
-hashed, so that two evaluations of the same set met the same worlds. Sets that claim to lie outside the training
-ranges are checked.
+hashed, so that two evaluations of the same set met the same worlds. Sets that claim to lie outside the
+training ranges are checked.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import jax
 import numpy as np
 
-from simreal.errors import UserError
-from simreal.randomizer import WorldBuilder, nearest
+from simreal.errors import UserError, nearest
+from simreal.randomizer import WorldBuilder
 
 Interval = tuple[float, float]
 
@@ -25,17 +25,18 @@ Interval = tuple[float, float]
 class WorldSet:
     """A set of worlds, each a draw of every factor.
 
-    `kind` says how worlds are made: "nominal" (nothing varies), "train" (fresh draws from the training ranges),
-    "outside" (see `outside`), "fixed" (the draws in `fixed`, other factors nominal: a stand-in for a real unit).
+    `kind` says how worlds are made: "nominal" (nothing varies), "train" (fresh draws from the training
+    ranges), "outside" (see `outside`), "fixed" (the draws in `fixed`, other factors nominal: a stand-in for a
+    real unit).
     """
 
     name: str
     description: str
     kind: Literal["nominal", "train", "outside", "fixed"]
-    outside: Mapping[str, Sequence[Interval]] = ()  # type: ignore[assignment]
-    """factor -> intervals beyond its training range. World i has factor i mod (F + 1) outside and the others as
-    in training; where that is F, all of them are outside at once."""
-    fixed: Mapping[str, float | Sequence[float]] = ()  # type: ignore[assignment]
+    outside: Mapping[str, Sequence[Interval]] = field(default_factory=dict)
+    """factor -> intervals beyond its training range. World i has factor i mod (F + 1) outside and the others
+    as in training; where that is F, all of them are outside at once."""
+    fixed: Mapping[str, float | Sequence[float]] = field(default_factory=dict)
 
     @property
     def claims_outside(self) -> bool:
@@ -48,12 +49,12 @@ class WorldSet:
         Raises:
             UserError: a factor that the builder does not have.
         """
-        for name in (*dict(self.outside), *dict(self.fixed)):
+        for name in (*self.outside, *self.fixed):
             if name not in builder.draw_distributions:
                 raise UserError(
                     f"set {self.name!r}: unknown factor {name!r}; {nearest(name, builder.draw_distributions)}"
                 )
-        base = jax.tree.map(np.asarray, builder.complete(dict(self.fixed)))
+        base = jax.tree.map(np.asarray, builder.complete(self.fixed))
         draws = {name: np.repeat(value[None], worlds, axis=0) for name, value in base.items()}
         if self.kind in ("train", "outside"):
             key = jax.random.fold_in(jax.random.PRNGKey(seed), _tag(self.name))
@@ -73,7 +74,8 @@ class WorldSet:
             values = random.uniform(chosen[:, 0], chosen[:, 1])
             moved = (turn == i) | (turn == len(factors))
             shape = (-1,) + (1,) * (draws[name].ndim - 1)
-            draws[name] = np.where(moved.reshape(shape), values.reshape(shape), draws[name]).astype(draws[name].dtype)
+            values = values.astype(draws[name].dtype).reshape(shape)
+            draws[name] = np.where(moved.reshape(shape), values, draws[name])
 
     def check(self, builder: WorldBuilder) -> None:
         """Checks that what claims to lie outside the training ranges does.
@@ -82,7 +84,7 @@ class WorldSet:
             UserError: names the factor, its interval or value, and its training range.
         """
         ranges = {name: d.range() for name, d in builder.draw_distributions.items()}
-        for name, intervals in dict(self.outside).items():
+        for name, intervals in self.outside.items():
             low, high = ranges[name]
             for start, end in intervals:
                 if start <= high and end >= low:
@@ -91,8 +93,8 @@ class WorldSet:
                         f"[{low:g}, {high:g}]"
                     )
         if self.kind == "fixed":
-            inside = {n: ranges[n] for n, v in dict(self.fixed).items() if _within(v, ranges[n])}
-            if len(inside) == len(dict(self.fixed)):
+            inside = {n: ranges[n] for n, v in self.fixed.items() if _within(v, ranges[n])}
+            if len(inside) == len(self.fixed):
                 raise UserError(f"set {self.name!r}: every factor lies inside its training range: {inside}")
 
 

@@ -36,7 +36,9 @@ def trajectory(env, world_draws, controls):
 
 def random_controls(env, seed=0):
     low, high = env.mj_model.actuator_ctrlrange.T
-    return jnp.asarray(np.random.default_rng(seed).uniform(low, high, (PHYSICS_STEPS, env.mj_model.nu)), float)
+    return jnp.asarray(
+        np.random.default_rng(seed).uniform(low, high, (PHYSICS_STEPS, env.mj_model.nu)), float
+    )
 
 
 @pytest.mark.parametrize("name", ["arm_reach", "cartpole_swingup"])
@@ -79,7 +81,8 @@ def test_go2_stands_at_the_same_height_on_both_engines():
 @pytest.mark.parametrize("engine", ["mujoco", "mjx"])
 def test_a_push_changes_momentum_by_its_impulse(engine):
     randomizer = simreal.Randomizer(
-        rate=disturbance.push_rate("cart").set(Uniform(0, 100)), hit=disturbance.push_impulse("cart").set(Uniform(0, 5))
+        rate=disturbance.push_rate("cart").set(Uniform(0, 100)),
+        hit=disturbance.push_impulse("cart").set(Uniform(0, 5)),
     )
     env = simreal.make("cartpole_swingup", engine=engine, randomizer=randomizer)
     world = env.randomizer.build({})
@@ -124,9 +127,10 @@ def test_torque_falls_with_speed_inside_the_engine(engine):
 
 @pytest.mark.parametrize("engine", ["mujoco", "mjx"])
 def test_a_delay_reaches_through_reset_and_step(engine):
-    """A 23 ms command delay on the environment's own 5 ms grid: nothing for four physics steps, then the command."""
+    """A 23 ms command delay on the environment's own 5 ms grid: nothing for four steps, then the command."""
     randomizer = simreal.Randomizer(
-        late=actuator.delay("slide").set(Uniform(0, 0.05)), sees=sensor.delay("cart_position").set(Uniform(0, 0.05))
+        late=actuator.delay("slide").set(Uniform(0, 0.05)),
+        sees=sensor.delay("cart_position").set(Uniform(0, 0.05)),
     )
     env = simreal.make("cartpole_swingup", engine=engine, randomizer=randomizer)
     step = jax.jit(env.step)
@@ -143,7 +147,8 @@ def test_a_delay_reaches_through_reset_and_step(engine):
 
     now, late = velocities(0.0), velocities(0.023)
     assert abs(late[0]) < 1e-6
-    # One control period (20 ms) and 3 ms of 5 ms lost: the push is 0.4 of a physics step later than a 20 ms delay.
+    # One control period (20 ms) and 3 ms of 5 ms lost: the push is 0.4 of a physics step later than a 20 ms
+    # delay.
     assert late[1] == pytest.approx(now[0] * (20 - 3) / 20, rel=0.02)
 
 
@@ -159,7 +164,8 @@ def test_gradients_flow_through_mjx_with_one_iteration():
 
 
 @pytest.mark.parametrize(
-    ("engine", "advice"), [("mujoco", "engine='mjx', solver_iterations=1"), ("mjx", "solver of one iteration")]
+    ("engine", "advice"),
+    [("mujoco", "engine='mjx', solver_iterations=1"), ("mjx", "solver of one iteration")],
 )
 def test_gradients_that_cannot_be_had_say_how_to_get_them(engine, advice):
     # Dry friction is a constraint, so that the solver has something to iterate on.
@@ -177,7 +183,9 @@ def test_mjx_refuses_a_delay_that_it_would_ignore():
         def model(self):
             import mujoco
 
-            return mujoco.MjModel.from_xml_string(MODEL.replace('name="slide"', 'name="slide" delay="0.01" nsample="4"'))
+            return mujoco.MjModel.from_xml_string(
+                MODEL.replace('name="slide"', 'name="slide" delay="0.01" nsample="4"')
+            )
 
     with pytest.raises(simreal.UserError, match="which mjx ignores"):
         Delayed(engine="mjx", randomizer=simreal.Randomizer())
@@ -190,7 +198,8 @@ def test_a_varied_friction_loss_is_not_compiled_away_on_mjx():
         env = simreal.make("cartpole_swingup", engine=engine, randomizer=randomizer)
         state = env.reset(jax.random.PRNGKey(0), world=env.randomizer.build({"dry": 15.0}))
         speeds.append(float(jax.jit(env.step)(state, jnp.ones(1)).physics.qvel[0] - state.physics.qvel[0]))
-    assert abs(speeds[1]) < 0.1 and speeds[0] == pytest.approx(speeds[1], abs=1e-3)
+    assert abs(speeds[1]) < 0.1
+    assert speeds[0] == pytest.approx(speeds[1], abs=1e-3)
 
 
 def test_unknown_engine():

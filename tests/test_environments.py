@@ -35,7 +35,8 @@ def test_shapes_names_and_units(name):
     assert env.action_size == len(env.actuators.names)
     assert round(env.control_dt / env.physics_dt) * env.physics_dt == pytest.approx(env.control_dt)
     moved = batched_step(name)(state, random_actions(env, 1)[0])
-    assert jax.tree.map(lambda x: (x.shape, x.dtype), moved) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
+    before, after = (jax.tree.map(lambda x: (x.shape, x.dtype), s) for s in (state, moved))
+    assert after == before
     assert set(moved.info) == {"truncation", "failed", "diverged", "success"}
 
 
@@ -83,7 +84,9 @@ def test_time_limit_is_truncation_and_not_failure(name):
     state = step(state, rest)
     assert not state.done.any()
     state = step(state, rest)
-    assert state.done.all() and state.info["truncation"].all() and not state.info["failed"].any()
+    assert state.done.all()
+    assert state.info["truncation"].all()
+    assert not state.info["failed"].any()
 
 
 def test_a_world_that_blows_up_ends_and_stays_finite(name):
@@ -91,7 +94,9 @@ def test_a_world_that_blows_up_ends_and_stays_finite(name):
     state = batched_reset(name)(keys(WORLDS))
     broken = state.physics.qvel.at[3].set(jnp.nan)
     after = step(state.replace(physics=state.physics.replace(qvel=broken)), random_actions(env, 1)[0])
-    assert after.info["diverged"][3] == 1 and after.done[3] == 1 and after.info["diverged"].sum() == 1
+    assert after.info["diverged"][3] == 1
+    assert after.done[3] == 1
+    assert after.info["diverged"].sum() == 1
     for leaf in (after.obs, after.privileged, after.reward, *after.metrics.values()):
         assert np.isfinite(np.asarray(leaf)).all()
 
@@ -99,7 +104,8 @@ def test_a_world_that_blows_up_ends_and_stays_finite(name):
 def test_sets_lie_outside_where_they_claim_to(name):
     env = environment(name)
     names = [s.name for s in env.world_sets]
-    assert names[:3] == ["nominal", "train", "held_out"] and len(names) >= 6
+    assert names[:3] == ["nominal", "train", "held_out"]
+    assert len(names) >= 6
     for worldset in env.world_sets:
         worldset.check(env.randomizer)
         draws = worldset.draws(env.randomizer, 24, seed=1)

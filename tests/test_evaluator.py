@@ -56,7 +56,8 @@ def test_two_runs_give_the_same_numbers_and_sets_their_digests(arm, servo):
     held_out = next(s for s in arm.world_sets if s.name == "held_out")
     first, second = (servo.run_set(held_out, WORLDS) for _ in range(2))
     np.testing.assert_array_equal(first.episode_return, second.episode_return)
-    assert first.digest == second.digest and first.claims_outside
+    assert first.digest == second.digest
+    assert first.claims_outside
     assert first.digest != servo.run_set(held_out, WORLDS - 1).digest
 
 
@@ -74,10 +75,12 @@ def test_a_controller_with_memory_beats_doing_nothing(arm, servo):
     nominal = next(s for s in arm.world_sets if s.name == "nominal")
     idle = Evaluator(arm, Idle(), seed=7, batch=WORLDS)
     worked, rested = servo.run_set(nominal, WORLDS), idle.run_set(nominal, WORLDS)
-    assert worked.success.mean() > 0.5 and rested.success.mean() < 0.2
+    assert worked.success.mean() > 0.5
+    assert rested.success.mean() < 0.2
     assert worked.digest == rested.digest
     assert worked.hardware["peak_torque"].max() <= 40.0 + 1e-3
-    assert (worked.steps == arm.episode_steps).all() and (worked.ended_by == 0).all()
+    assert (worked.steps == arm.episode_steps).all()
+    assert (worked.ended_by == 0).all()
     assert rested.hardware["action_rate"].max() == 0
 
 
@@ -85,7 +88,9 @@ def test_factor_curves_reach_beyond_training_and_stay_possible(arm):
     for factor, bound in arm.randomizer.bound.items():
         values = sweep_values(arm, factor, 7)
         low, high = bound.factor.distribution.range()
-        assert values.shape == (7,) and values[-1] >= high - 1e-9 and values[0] >= bound.lowest - 1e-9
+        assert values.shape == (7,)
+        assert values[-1] >= high - 1e-9
+        assert values[0] >= bound.lowest - 1e-9
         assert values[0] < low or bound.lowest >= low - 1e-6
         if bound.factor.target.quantity == "delay":
             assert values[-1] <= arm.max_delay
@@ -93,10 +98,12 @@ def test_factor_curves_reach_beyond_training_and_stay_possible(arm):
 
 def test_a_factor_curve_and_a_heat_map_move_their_factors_only(arm, servo):
     curve = servo.run_factor("payload", np.array([0.0, 4.0]), 8)
-    assert curve.success.shape == (2, 8) and (curve.train_low, curve.train_high) == (0.0, 0.8)
+    assert curve.success.shape == (2, 8)
+    assert (curve.train_low, curve.train_high) == (0.0, 0.8)
     assert curve.episode_return[0].mean() > curve.episode_return[1].mean()
     heat = servo.run_heat_map({"payload": curve, "tilt": servo.run_factor("tilt", np.array([0.0]), 8)}, 4)
-    assert heat is not None and {heat.factor_x, heat.factor_y} == {"payload", "tilt"}
+    assert heat is not None
+    assert {heat.factor_x, heat.factor_y} == {"payload", "tilt"}
     assert heat.success.shape == (5, 5, 4)
 
 

@@ -61,8 +61,10 @@ class Probe(Environment):
 
     def model(self):
         return mujoco.MjModel.from_xml_string(
-            """<mujoco><worldbody><body><joint name="slide" type="slide"/><geom size=".1" mass="1"/></body></worldbody>
-            <actuator><motor name="push" joint="slide" ctrlrange="-1 1" ctrllimited="true"/></actuator></mujoco>"""
+            """<mujoco>
+            <worldbody><body><joint name="slide" type="slide"/><geom size=".1" mass="1"/></body></worldbody>
+            <actuator><motor name="push" joint="slide" ctrlrange="-1 1" ctrllimited="true"/></actuator>
+            </mujoco>"""
         )
 
     def start(self, key):
@@ -139,7 +141,12 @@ def probe_config(**changes):
         environment="probe",
         worlds=64,
         learner=LearnerConfig(
-            unroll_length=8, discount=0.9, entropy_cost=0.0, iterations_per_epoch=25, learning_rate=3e-3, clip_value=None
+            unroll_length=8,
+            discount=0.9,
+            entropy_cost=0.0,
+            iterations_per_epoch=25,
+            learning_rate=3e-3,
+            clip_value=None,
         ),
         network=NetworkConfig(policy_layers=(32,), value_layers=(32,), initial_noise=0.5),
         rollout=RolloutConfig(stagger=False, greedy_worlds=1, reset_capacity=65),
@@ -205,14 +212,15 @@ def test_same_state_same_bits_and_one_compile_per_function(acting):
     learner, state = acting
     first, second = (learner.epoch(copy(state))[0] for _ in range(2))
     assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.array_equal(a, b)), first.params, second.params))
-    assert learner._collect._cache_size() == 1 and learner._update._cache_size() == 1
+    assert learner._collect._cache_size() == 1
+    assert learner._update._cache_size() == 1
 
 
 def test_a_gradient_that_is_not_finite_is_skipped_and_counted(acting):
     learner, state = acting
     state = copy(state)
     before = copy(state.params)
-    rollout, data, _ = learner._collect(
+    _, data, _ = learner._collect(
         state.rollout, state.params.policy, state.normalizer, state.ranges, jax.random.PRNGKey(0)
     )
     data = data._replace(reward=data.reward.at[0, 0].set(jnp.nan))
@@ -241,7 +249,8 @@ def test_the_exported_policy_is_the_trained_one(acting, tmp_path):
     loaded = simreal.load_policy(tmp_path)
     np.testing.assert_allclose(loaded(obs)[0], np.clip(mean, -1, 1), atol=1e-5)
     np.testing.assert_allclose(jax.jit(lambda o: loaded(o)[0])(jnp.asarray(obs)), loaded(obs)[0], atol=1e-5)
-    assert loaded.interface.observations == [["sign", "1"]] and loaded.initial_state() == ()
+    assert loaded.interface.observations == [["sign", "1"]]
+    assert loaded.initial_state() == ()
     (tmp_path / "policy" / "weights.npz").write_bytes(b"short")
     with pytest.raises(simreal.UserError, match="damaged"):
         simreal.load_policy(tmp_path)

@@ -15,7 +15,6 @@ from simreal.actuators import limit_control
 from simreal.errors import UserError
 from simreal.world import World
 
-
 _UNLIMITED = (-np.inf, np.inf)
 
 
@@ -50,7 +49,8 @@ class Data:
         if name in fields:
             return fields[name]
         raise AttributeError(
-            f"Data has no field {name!r}: add it to the environment's data_fields (now: {', '.join(fields) or 'none'})"
+            f"Data has no field {name!r}: add it to the environment's data_fields "
+            f"(now: {', '.join(fields) or 'none'})"
         )
 
 
@@ -92,8 +92,8 @@ class Engine(abc.ABC):
     ) -> None:
         self.model = mujoco.MjModel.__copy__(model)
         if limits_force:
-            # A limited force may need a control outside ctrlrange, which MuJoCo would clamp back; `limited` clamps
-            # before it limits.
+            # A limited force may need a control outside ctrlrange, which MuJoCo would clamp back; `limited`
+            # clamps before it limits.
             self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
         self.varied = varied
         self.data_fields = data_fields
@@ -106,7 +106,9 @@ class Engine(abc.ABC):
         self._dofadr = model.jnt_dofadr[joints] if model.njnt else joints
         self._gear = np.where(joint, model.actuator_gear[:, 0], 0.0)
 
-    def limited(self, xp: Any, control: Any, physics: Any, gain: Any, bias: Any, limits: dict[str, Any]) -> Any:
+    def limited(
+        self, xp: Any, control: Any, physics: Any, gain: Any, bias: Any, limits: dict[str, Any]
+    ) -> Any:
         """The control (..., nu) whose force stays inside the torque-speed curve, in NumPy or JAX.
 
         Args:
@@ -116,7 +118,8 @@ class Engine(abc.ABC):
             gain: (..., nu) and bias: (..., nu, 3), of the actuators.
             limits: from `simreal.actuators.Actuators.limits`.
         """
-        low, high = np.where(self.model.actuator_ctrllimited[:, None], self.model.actuator_ctrlrange, _UNLIMITED).T
+        clamped = self.model.actuator_ctrllimited.astype(bool)[:, None]
+        low, high = np.where(clamped, self.model.actuator_ctrlrange, _UNLIMITED).T
         velocity = physics["qvel"][..., self._dofadr] * self._gear
         length = physics["qpos"][..., self._qposadr] * self._gear
         return limit_control(xp, xp.clip(control, low, high), velocity, length, gain, bias, limits)
@@ -150,7 +153,8 @@ def refuse_gradient(x: jax.Array) -> jax.Array:
 @refuse_gradient.defjvp
 def _refuse(primals: Any, tangents: Any) -> Any:
     raise UserError(
-        "the mujoco engine has no gradients; use simreal.make(..., engine='mjx', solver_iterations=1) for them"
+        "the mujoco engine has no gradients; "
+        "use simreal.make(..., engine='mjx', solver_iterations=1) for them"
     )
 
 

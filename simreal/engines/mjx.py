@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from simreal.constants import C_ONLY
 from simreal.engines.base import Data, Engine, Inputs, Physics, refuse_reverse_gradient
 from simreal.errors import UserError
 from simreal.quiet import import_mjx
@@ -17,8 +18,8 @@ from simreal.world import World
 mjx = import_mjx()
 
 _LIFTED = 1e-9
-"""Least friction loss (N m) of a joint whose friction loss varies. MJX compiles a nominal zero away, and takes a row
-of zero friction for an equality constraint, which locks the joint."""
+"""Least friction loss (N m) of a joint whose friction loss varies. MJX compiles a nominal zero away, and
+takes a row of zero friction for an equality constraint, which locks the joint."""
 
 
 class MjxEngine(Engine):
@@ -31,26 +32,24 @@ class MjxEngine(Engine):
         if np.any(self.model.actuator_delay > 0):
             names = [self.model.actuator(i).name for i in np.flatnonzero(self.model.actuator_delay > 0)]
             raise UserError(
-                f"the model gives actuator {names[0]!r} a delay, which mjx ignores; remove it from the MJCF and "
-                f"use the factor actuator.delay({names[0]!r}), or engine='mujoco'"
+                f"the model gives actuator {names[0]!r} a delay, which mjx ignores; remove it from the MJCF "
+                f"and use the factor actuator.delay({names[0]!r}), or engine='mujoco'"
             )
         model = mujoco.MjModel.__copy__(self.model)
         if "dof_frictionloss" in self.varied:
             model.dof_frictionloss[:] = np.maximum(model.dof_frictionloss, _LIFTED)
-        # "Same frame" is a shortcut that MJX takes while compiling; where a centre of mass varies there is none.
+        # The nominal shortcut of frames that coincide does not hold where a centre of mass varies.
         for name in ("body_sameframe", "geom_sameframe"):
             if name in self.varied:
                 getattr(model, name)[:] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
         self._mjx_model = jax.tree.map(jnp.asarray, mjx.put_model(model, impl="jax"))
         self._mjx_data = jax.tree.map(jnp.asarray, mjx.make_data(model, impl="jax"))
-        self._known = tuple(
-            n for n in self.varied if _has(self._mjx_model, n) and not n.endswith("sameframe")
-        )
+        self._replaced = tuple(name for name in self.varied if name not in C_ONLY)
         constrained = self._mjx_data._impl.efc_J.size > 0
         self._guard = constrained and self.model.opt.iterations > 1  # a while loop inside the solver
 
     def _load(self, world: World, physics: Physics) -> tuple[Any, Any]:
-        fields = {name: world.model[name] for name in self._known}
+        fields = {name: world.model[name] for name in self._replaced}
         if "dof_frictionloss" in fields:
             fields["dof_frictionloss"] = jnp.maximum(fields["dof_frictionloss"], _LIFTED)
         model = self._mjx_model.tree_replace(fields)
@@ -126,8 +125,3 @@ class MjxEngine(Engine):
 
 def _get(data: Any, name: str) -> jax.Array:
     return getattr(data, name) if hasattr(data, name) else getattr(data._impl, name)
-
-
-def _has(model: Any, name: str) -> bool:
-    owner, attribute = (model.opt, name[4:]) if name.startswith("opt.") else (model, name)
-    return hasattr(owner, attribute)

@@ -9,10 +9,11 @@ world changes and not at every step.
 from __future__ import annotations
 
 import ctypes
+import dataclasses
 import functools
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -86,10 +87,17 @@ class MujocoEngine(Engine):
             fields={name: out[name] for name in self.data_fields},
         )
 
-    def _call(self, host, names: tuple[str, ...], world: World, physics: Physics, inputs: Inputs | None):
+    def _call(
+        self,
+        host: Callable[..., dict[str, np.ndarray]],
+        names: tuple[str, ...],
+        world: World,
+        physics: Physics,
+        inputs: Inputs | None,
+    ) -> dict[str, jax.Array]:
         dtype = physics.qpos.dtype
         shapes = {name: jax.ShapeDtypeStruct(self._shapes[name], dtype) for name in names}
-        physics = physics.replace(qpos=refuse_gradient(physics.qpos))  # type: ignore[attr-defined]
+        physics = dataclasses.replace(physics, qpos=refuse_gradient(physics.qpos))
         model = {name: world.model[name] for name in self.varied}
         if inputs is not None:
             inputs = jax.tree.map(refuse_gradient, inputs)
@@ -99,7 +107,9 @@ class MujocoEngine(Engine):
 
     # -- on the host: NumPy only, for a JAX call in here can deadlock ---------------------------------------
 
-    def _host_forward(self, number: Any, model: dict, physics: Physics, inputs: None) -> dict[str, np.ndarray]:
+    def _host_forward(
+        self, number: Any, model: dict, physics: Physics, inputs: None
+    ) -> dict[str, np.ndarray]:
         with self._rows(number, model, physics) as (rows, lead, dtype):
             rows.state["ctrl"][:] = 0
             rows.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
@@ -135,7 +145,9 @@ class MujocoEngine(Engine):
             rows.batch.step(nstep=1, stage=velocity_stage if last else mujoco.mjtStage.mjSTAGE_NONE)
 
     @contextmanager
-    def _rows(self, number: Any, model: dict, physics: Physics) -> Iterator[tuple[_Rows, tuple[int, ...], Any]]:
+    def _rows(
+        self, number: Any, model: dict, physics: Physics
+    ) -> Iterator[tuple[_Rows, tuple[int, ...], Any]]:
         """A batch of the right size, its model rows and states written; not shared with another thread."""
         number = np.asarray(number)
         lead = number.shape[:-1]

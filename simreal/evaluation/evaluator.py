@@ -1,7 +1,7 @@
 """Runs a policy through sets of worlds, one episode in each, and writes down what happened.
 
-Worlds and keys depend on the set, the world's index and the seed, never on the policy: two policies evaluated with
-the same seed met the same worlds and the same noise, so that their differences are paired.
+Worlds and keys depend on the set, the world's index and the seed, never on the policy: two policies evaluated
+with the same seed met the same worlds and the same noise, so that their differences are paired.
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from simreal.environment import Environment, State
-from simreal.errors import UserError
-from simreal.evaluation.results import ENDINGS, FactorCurve, HeatMap, SetResult
+from simreal.errors import UserError, nearest
 from simreal.evaluation.ranges import sweep_values
-from simreal.randomizer import nearest
+from simreal.evaluation.results import ENDINGS, FactorCurve, HeatMap, SetResult
 from simreal.worldsets import TRAIN, WorldSet, digest
 
 Draws = Mapping[str, np.ndarray]
@@ -139,9 +138,13 @@ class Evaluator:
         n = index.shape[0]
         keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.PRNGKey(self.seed), index)
         state = jax.vmap(lambda key, world: self.env.reset(key, world=world))(keys, worlds)
-        memory = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[None], n, axis=0), self.policy.initial_state())
+        memory = jax.tree.map(
+            lambda x: jnp.repeat(jnp.asarray(x)[None], n, axis=0), self.policy.initial_state()
+        )
         zero = jnp.zeros_like(state.reward)
-        sums = dict.fromkeys(("episode_return", "success", "steps", "saturated", "power", "action_rate"), zero)
+        sums = dict.fromkeys(
+            ("episode_return", "success", "steps", "saturated", "power", "action_rate"), zero
+        )
         totals = {**sums, "peak_torque": zero, "ended_by": zero.astype(jnp.int32)}
 
         def unfinished(carry: tuple) -> jax.Array:
@@ -193,7 +196,7 @@ def _accumulate(totals: dict[str, jax.Array], state: State, alive: jax.Array) ->
 
 
 def _cross(base: Draws, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The base worlds once for every combination of the values, the last factor and then worlds running fastest."""
+    """The base worlds once for every combination of values; worlds run fastest, then the last factor."""
     worlds = len(next(iter(base.values())))
     grid = np.meshgrid(*values.values(), indexing="ij")
     combinations = math.prod(len(v) for v in values.values())

@@ -16,8 +16,8 @@ BEYOND = 0.5
 def sweep_values(env: Environment, factor: str, points: int) -> np.ndarray:
     """`points` values of a factor, (points,), across its training range and beyond, as far as physics allows.
 
-    They reach half a width beyond each end (in logarithms for a log-uniform factor), and at least to the ends of
-    the environment's held-out intervals.
+    They reach half a width beyond each end (in logarithms for a log-uniform factor), and at least to the ends
+    of the environment's held-out intervals.
     """
     bound = env.randomizer.bound[factor]
     distribution = bound.factor.distribution
@@ -32,7 +32,7 @@ def sweep_values(env: Environment, factor: str, points: int) -> np.ndarray:
     if logarithmic:
         low, high = math.exp(low), math.exp(high)
     for worldset in env.world_sets:
-        for interval in dict(worldset.outside).get(factor, ()):
+        for interval in worldset.outside.get(factor, ()):
             low, high = min(low, interval[0]), max(high, interval[1])
     low = max(low, bound.lowest)
     if bound.factor.target.quantity == "delay":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import operator
 import re
@@ -10,7 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from simreal.errors import UserError
+from simreal.errors import UserError, nearest_first
 
 OPERATORS: dict[str, Callable[[float, float], bool]] = {
     ">=": operator.ge,
@@ -75,7 +74,7 @@ def parse_requirement(text: str, sets: Collection[str] | None = None) -> Require
     if not path:
         raise UserError(f"--require '{text}': '{name}' names no metric, as '{name}.success' would")
     if path not in PATHS:
-        raise UserError(f"--require '{text}': no metric '{path}'; valid: {_nearest_first(path, PATHS)}")
+        raise UserError(f"--require '{text}': no metric '{path}'; {nearest_first(path, PATHS)}")
     if sets is not None:
         _check_set(text, name, sets)
     metric, _, bound = path.partition(".")
@@ -106,7 +105,7 @@ def check(requirements: Sequence[Requirement], transfer: dict[str, Any]) -> list
 
 def _check_set(text: str, name: str, sets: Collection[str]) -> None:
     if name not in sets:
-        raise UserError(f"--require '{text}': no set '{name}'; valid: {_nearest_first(name, sets)}")
+        raise UserError(f"--require '{text}': no set '{name}'; {nearest_first(name, sets)}")
 
 
 def _number(text: str, written: str) -> float:
@@ -117,8 +116,3 @@ def _number(text: str, written: str) -> float:
     if not math.isfinite(threshold):
         raise UserError(f"--require '{text}': '{written}' is not a number, as in '{EXAMPLE}'")
     return threshold
-
-
-def _nearest_first(given: str, valid: Collection[str]) -> str:
-    near = difflib.get_close_matches(given, valid, n=len(valid) or 1, cutoff=0.5)
-    return ", ".join([*near, *(name for name in valid if name not in near)])
