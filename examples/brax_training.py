@@ -10,7 +10,8 @@ import simreal
 from simreal.brax_adapter import BraxEnv
 
 
-def main(steps: int = 200_000) -> float:
+def main(steps: int = 200_000) -> list[float]:
+    """Trains for `steps` environment steps; returns the mean return at each evaluation."""
     from brax.training.agents.ars import train as ars
 
     env = simreal.make("cartpole_swingup", randomizer=simreal.Randomizer())
@@ -34,7 +35,7 @@ def main(steps: int = 200_000) -> float:
         max_devices_per_host=1,
     )
     train(environment=BraxEnv(env), progress_fn=progress)
-    return history[-1]
+    return history
 
 
 if __name__ == "__main__":

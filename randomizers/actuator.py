@@ -50,6 +50,11 @@ def thermal_time(*actuators: str) -> Target:
     return target("actuator", "thermal_time", actuators)
 
 
+def initial_heat(*actuators: str) -> Target:
+    """Heat at the start of the episode: 0 cold, 1 as warm as after a long time at `thermal_limit`."""
+    return target("actuator", "initial_heat", actuators)
+
+
 def noise(*actuators: str) -> Target:
     """Standard deviation of white noise on commands (control unit)."""
     return target("actuator", "noise", actuators)

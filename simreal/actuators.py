@@ -67,6 +67,9 @@ UNITS: Mapping[str, str] = MappingProxyType(
     }
 )
 
+POSITIVE = frozenset({"no_load_speed", "thermal_limit"})
+"""Parameters that a value of 0 makes meaningless."""
+
 HOTTEST = 1.5
 """Heat at which a drive has folded its peak force back to the continuous one."""
 

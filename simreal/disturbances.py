@@ -11,6 +11,8 @@ import jax.numpy as jnp
 PARAMETERS: Mapping[str, float] = MappingProxyType({"push_rate": 0.0, "push_impulse": 0.0})
 """Parameter -> its value without effect."""
 
+UNITS: Mapping[str, str] = MappingProxyType({"push_rate": "1/s", "push_impulse": "N s"})
+
 
 def push_force(parameters: Mapping[str, jax.Array], control_dt: float, key: jax.Array) -> jax.Array:
     """Force (3,) in N on the pushed body during one control step, world frame; zero between pushes.

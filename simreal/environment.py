@@ -12,7 +12,7 @@ actuators, sensors and disturbances of each episode come from its World.
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import jax
@@ -22,13 +22,12 @@ import numpy as np
 from flax import struct
 
 from simreal import actuators as actuators_module
+from simreal import disturbances
 from simreal import sensors as sensors_module
 from simreal.actuators import Actuators, ActuatorState
-from simreal.disturbances import PARAMETERS as DISTURBANCES
-from simreal.disturbances import push_force
 from simreal.engines import Data, Inputs, Physics, engine_class, resolve
 from simreal.errors import UserError, nearest
-from simreal.quantities import PARAMETER_UNITS, element_names
+from simreal.quantities import control_units, element_names
 from simreal.randomizer import ParameterGroup, Randomizer, Ranges, WorldBuilder
 from simreal.sensors import Sensors, SensorState
 from simreal.world import World
@@ -201,40 +200,54 @@ class Environment(abc.ABC):
 
     def _parameter_groups(self, randomizer: Randomizer) -> dict[str, ParameterGroup]:
         bodies = element_names(self.mj_model, "body")
-        units = PARAMETER_UNITS
+        reading_units = [unit for size, unit in self.readings.values() for _ in range(size)]
         pushed = any(f.target.group == "disturbance" for f in randomizer.factors.values())
         return {
             "actuator": ParameterGroup(
-                self.actuators.names, jax.tree.map(np.asarray, self.actuators.nominal()), units
+                self.actuators.names,
+                jax.tree.map(np.asarray, self.actuators.nominal()),
+                _resolve(actuators_module.UNITS, "control", control_units(self.mj_model)),
+                actuators_module.POSITIVE,
             ),
             "sensor": ParameterGroup(
-                self.sensors.channels, jax.tree.map(np.asarray, self.sensors.nominal()), units
+                self.sensors.channels,
+                jax.tree.map(np.asarray, self.sensors.nominal()),
+                _resolve(sensors_module.UNITS, "reading", reading_units),
             ),
             "disturbance": ParameterGroup(
                 tuple(bodies),
-                {k: np.asarray(v) for k, v in DISTURBANCES.items()} if pushed else {},
-                units,
+                {k: np.asarray(v) for k, v in disturbances.PARAMETERS.items()} if pushed else {},
+                {k: (unit,) * len(bodies) for k, unit in disturbances.UNITS.items()},
             ),
         }
 
     def _check_factors(self) -> None:
-        """Refuses what an actuator or a buffer cannot do."""
-        driven = self.mj_model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
-        servo = self.mj_model.actuator_biasprm[:, 1] != 0
-        for name, bound in self.randomizer.bound.items():
-            target = bound.factor.target
-            if target.quantity == "delay":
-                self.check_delay(f"factor {name!r}", bound.factor.distribution.support()[1])
-            if target.quantity in ("no_load_speed", "thermal_limit") and not driven[bound.mask].all():
-                raise UserError(
-                    f"factor {name!r}: {target.quantity} needs actuators that drive a joint directly"
-                )
-            if target.quantity == "backlash" and not servo[bound.mask].all():
-                wrong = self.actuators.names[int(np.flatnonzero(bound.mask & ~servo)[0])]
-                raise UserError(
-                    f"factor {name!r}: backlash is play of a position command; "
-                    f"{wrong!r} is no position actuator"
-                )
+        """Refuses what a body, an actuator or a buffer cannot do."""
+        model = self.mj_model
+        undriven = model.actuator_trntype != int(mujoco.mjtTrn.mjTRN_JOINT)
+        servo = model.actuator_biasprm[:, 1] != 0
+        undriven_reason = "needs actuators that drive a joint directly, which {name!r} does not"
+        refusals = {
+            "body_com": (
+                model.body_simple > 0,
+                "cannot vary on {name!r}, whose centre of mass MuJoCo takes for its origin; "
+                'add simple="false" to that body in the MJCF',
+            ),
+            "no_load_speed": (undriven, undriven_reason),
+            "thermal_limit": (undriven, undriven_reason),
+            "backlash": (~servo, "is play of a position command; {name!r} is no position actuator"),
+            "deadband": (servo, "is for torque and speed commands; {name!r} is a position actuator"),
+        }
+        for factor, bound in self.randomizer.bound.items():
+            quantity = bound.factor.target.quantity
+            if quantity == "delay":
+                self.check_delay(f"factor {factor!r}", bound.factor.distribution.support()[1])
+            if quantity in refusals:
+                refused, reason = refusals[quantity]
+                names = element_names(model, "body") if quantity == "body_com" else self.actuators.names
+                rows = np.flatnonzero(bound.mask & refused)
+                if rows.size:
+                    raise UserError(f"factor {factor!r}: {quantity} {reason.format(name=names[rows[0]])}")
 
     def check_delay(self, where: str, delay: float) -> None:
         """Raises UserError where a delay (s) is longer than the buffers hold."""
@@ -307,10 +320,13 @@ class Environment(abc.ABC):
         controls, actuator = self.actuators.controls(
             now.actuator, state.actuator, self.control(action), actuator_key
         )
+        pushes = now.disturbance
         inputs = Inputs(
             controls=controls,
             limits=self.actuators.limits(now.actuator, actuator, self._force_limit(now)),
-            push=push_force(now.disturbance, self.control_dt, push_key) if now.disturbance else None,
+            push=disturbances.push_force(now.disturbance, self.control_dt, push_key)
+            if now.disturbance
+            else None,
             period_scale=self.actuators.period_scale(now.actuator, period_key),
         )
         physics, data = self.engine.step(now, state.physics, inputs)
@@ -409,6 +425,11 @@ def _effects(
     """The effects whose parameters some factor of the group targets."""
     targeted = {f.target.quantity for f in randomizer.factors.values() if f.target.group == group}
     return frozenset(effect for effect, parameters in effects.items() if targeted & parameters.keys())
+
+
+def _resolve(units: Mapping[str, str], own: str, of_elements: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Units of parameters for each element, whose own unit takes the place of the word `own`."""
+    return {k: tuple(unit.replace(own, other) for other in of_elements) for k, unit in units.items()}
 
 
 __all__ = ["Data", "Environment", "State", "Task"]

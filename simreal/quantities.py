@@ -193,21 +193,18 @@ def nominal_field(model: mujoco.MjModel, name: str) -> np.ndarray:
     return np.array(getattr(owner, attribute))
 
 
-PARAMETER_UNITS: dict[str, str] = {
-    "delay": "s",
-    "lag": "s",
-    "correlation_time": "s",
-    "thermal_time": "s",
-    "burst_duration": "s",
-    "burst_rate": "1/s",
-    "rate": "Hz",
-    "saturation": "1",
-    "scale": "1",
-    "dropout": "1",
-    "period_jitter": "1",
-    "no_load_speed": "rad/s",
-    "thermal_limit": "N m",
-    "push_rate": "1/s",
-    "push_impulse": "N s",
-}
-"""Units of actuator, sensor and disturbance parameters; the others are in the unit of their control or reading."""
+def control_units(model: mujoco.MjModel) -> list[str]:
+    """The unit of each actuator's control, where it can be told: a servo's position, or a motor's force."""
+    units = []
+    for i in range(model.nu):
+        driven = model.actuator_trntype[i] == int(mujoco.mjtTrn.mjTRN_JOINT)
+        turns = driven and model.jnt_type[model.actuator_trnid[i, 0]] == int(mujoco.mjtJoint.mjJNT_HINGE)
+        slides = driven and model.jnt_type[model.actuator_trnid[i, 0]] == int(mujoco.mjtJoint.mjJNT_SLIDE)
+        gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i, :3]
+        if (turns or slides) and gain != 0 and bias[1] == -gain:
+            units.append("rad" if turns else "m")
+        elif (turns or slides) and gain == 1 and not bias.any():
+            units.append("N m" if turns else "N")
+        else:
+            units.append("control")
+    return units

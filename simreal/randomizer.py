@@ -133,7 +133,11 @@ class ParameterGroup:
 
     elements: tuple[str, ...]
     nominal: Mapping[str, np.ndarray]
-    units: Mapping[str, str]
+    """Parameter -> its value without effect, one per element or a scalar for all."""
+    units: Mapping[str, Sequence[str]]
+    """Parameter -> its unit for each element."""
+    positive: frozenset[str] = frozenset()
+    """Parameters that must stay above 0."""
 
 
 class WorldBuilder:
@@ -296,16 +300,16 @@ class WorldBuilder:
                 raise UserError(f"{where}: unknown quantity; {nearest(target.quantity, QUANTITIES)}")
             quantity = QUANTITIES[target.quantity]
             names = element_names(model, quantity.element)
-            unit, lowest, strict = quantity.unit, quantity.lowest, quantity.strict
-            operations = quantity.operations
+            units: Sequence[str] = (quantity.unit,) * len(names)
+            lowest, strict, operations = quantity.lowest, quantity.strict, quantity.operations
             values = self._physical_values(model, target)
         else:
             group = self.groups[target.group]
             if target.quantity not in group.nominal:
                 raise UserError(f"{where}: unknown quantity; {nearest(target.quantity, group.nominal)}")
-            names, unit = list(group.elements), group.units.get(target.quantity, "")
-            operations = tuple(OPERATIONS)
-            lowest, strict = -math.inf if target.quantity == "bias" else 0.0, False
+            names, units, operations = list(group.elements), group.units[target.quantity], tuple(OPERATIONS)
+            lowest = -math.inf if target.quantity == "bias" else 0.0
+            strict = target.quantity in group.positive
             values = np.asarray(group.nominal[target.quantity]).reshape(-1)
             if values.size == 1 and len(names) != 1:
                 names = ["*"]
@@ -317,11 +321,11 @@ class WorldBuilder:
         nominal = values[mask]
         _check_support(where, factor, nominal, lowest, strict)
         identity = _IDENTITY.get(factor.operation, float(nominal[0]))
-        least = lowest + (1e-3 * max(float(np.max(np.abs(nominal))), 1e-3) if strict else 0.0)
+        size = float(np.max(np.abs(nominal), where=np.isfinite(nominal), initial=1e-3))
+        least = lowest + (1e-3 * size if strict else 0.0)
         smallest = {"times": 1e-3, "plus": least - float(np.min(nominal)), "set": least}[factor.operation]
-        return Bound(
-            factor, "x" if factor.operation == "times" else unit, mask, int(mask.sum()), identity, smallest
-        )
+        unit = "x" if factor.operation == "times" else units[int(np.argmax(mask))]
+        return Bound(factor, unit, mask, int(mask.sum()), identity, smallest)
 
     @staticmethod
     def _physical_values(model: mujoco.MjModel, target: Target) -> np.ndarray:
@@ -345,6 +349,8 @@ def _valid_names(names: list[str]) -> list[str]:
 def _check_support(where: str, factor: Factor, nominal: np.ndarray, lowest: float, strict: bool) -> None:
     """Raises UserError where some draw would make a value impossible."""
     low, high = factor.distribution.support()
+    if factor.operation != "set" and np.all(np.isinf(nominal)):
+        raise UserError(f"{where}: the nominal value is infinite, so only set changes it")
     earliest = factor.time.support()[0] if factor.time is not None else 0.0
     if earliest < 0:
         raise UserError(f"{where}: the event's time may be {earliest:g} s; it must be at least 0")

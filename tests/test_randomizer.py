@@ -12,6 +12,7 @@ from scipy import stats
 
 import simreal
 from simreal.distributions import Beta, Choice, LogUniform, Normal, TruncatedNormal, Uniform
+from simreal.envs.cartpole_swingup import MODEL, CartpoleSwingup
 from simreal.quantities import QUANTITIES, nominal_field
 from simreal.randomizers import actuator, disturbance, physics, sensor
 from simreal.rollout import Rollout
@@ -189,6 +190,36 @@ def test_events_jump_at_their_time():
     assert swapped.at(jnp.asarray(2.0)).model["dof_damping"][0] == pytest.approx(nominal)
 
 
+class Weighted(CartpoleSwingup):
+    """With a body that MuJoCo finds simple: nothing but a slide, the centre of mass at the origin."""
+
+    def model(self):
+        weight = '<body name="weight"><joint type="slide"/><geom size=".1" mass="1"/></body>'
+        return mujoco.MjModel.from_xml_string(MODEL.replace("</worldbody>", weight + "</worldbody>"))
+
+
+def test_units_are_those_of_what_is_addressed():
+    go2 = environment("go2_walk").randomizer
+    assert go2.bound["gyro_noise"].unit == "rad/s"
+    assert go2.bound["encoder_noise"].unit == "rad"
+    assert go2.bound["motor_delay"].unit == "s"
+    assert go2.bound["push_impulse"].unit == "N s"
+    assert go2.bound["kp"].unit == "x"
+    factors = {
+        "play": actuator.backlash("*").set(Uniform(0, 0.1)),
+        "far": sensor.drift("gyro").set(Uniform(0, 1)),
+    }
+    bound = environment("go2_walk").replace(randomizer=simreal.Randomizer(**factors)).randomizer.bound
+    assert (bound["play"].unit, bound["far"].unit) == ("rad", "rad/s/sqrt(s)")
+    assert environment("arm_reach").randomizer.bound["motor_noise"].unit == "N m"
+
+
+def test_a_sweep_of_no_load_speed_stays_above_zero():
+    factor = actuator.no_load_speed("slide").set(Uniform(2, 20))
+    env = simreal.make("cartpole_swingup", randomizer=simreal.Randomizer(f=factor))
+    assert 0 < env.randomizer.bound["f"].lowest < 0.1
+
+
 def make_bad(**factors):
     return lambda: simreal.make("cartpole_swingup", randomizer=simreal.Randomizer(**factors))
 
@@ -209,6 +240,24 @@ BAD = {
     "backlash of a torque motor": (
         make_bad(f=actuator.backlash("*").set(Uniform(0, 0.1))),
         "no position actuator",
+    ),
+    "deadband of a servo": (
+        lambda: environment("go2_walk").replace(
+            randomizer=simreal.Randomizer(f=actuator.deadband("*").set(Uniform(0, 0.1)))
+        ),
+        "is a position actuator",
+    ),
+    "centre of mass of a simple body": (
+        lambda: Weighted(
+            randomizer=simreal.Randomizer(f=physics.body_com("weight").plus(Uniform(-0.1, 0.1)))
+        ),
+        'add simple="false" to that body',
+    ),
+    "no speed at all": (make_bad(f=actuator.no_load_speed("*").set(Uniform(0, 10))), "must be above 0"),
+    "no force at all": (make_bad(f=actuator.thermal_limit("*").set(Uniform(0, 1))), "must be above 0"),
+    "scaling infinity": (
+        make_bad(f=actuator.no_load_speed("*").times(Uniform(0.5, 1))),
+        "only set changes it",
     ),
     "push on nothing": (make_bad(f=disturbance.push_rate("pol").set(Uniform(0, 1))), "did you mean 'pole'"),
     "no operation": (make_bad(f=physics.body_mass("pole")), "give it an operation"),
