@@ -324,9 +324,7 @@ class Environment(abc.ABC):
         inputs = Inputs(
             controls=controls,
             limits=self.actuators.limits(now.actuator, actuator, self._force_limit(now)),
-            push=disturbances.push_force(now.disturbance, self.control_dt, push_key)
-            if now.disturbance
-            else None,
+            push=disturbances.push_force(pushes, self.control_dt, push_key) if pushes else None,
             period_scale=self.actuators.period_scale(now.actuator, period_key),
         )
         physics, data = self.engine.step(now, state.physics, inputs)

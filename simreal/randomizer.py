@@ -12,6 +12,7 @@ The structure is static; `builder.ranges` is a pytree of arrays that may be trac
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -324,7 +325,8 @@ class WorldBuilder:
         size = float(np.max(np.abs(nominal), where=np.isfinite(nominal), initial=1e-3))
         least = lowest + (1e-3 * size if strict else 0.0)
         smallest = {"times": 1e-3, "plus": least - float(np.min(nominal)), "set": least}[factor.operation]
-        unit = "x" if factor.operation == "times" else units[int(np.argmax(mask))]
+        addressed = dict.fromkeys(itertools.compress(units, mask))
+        unit = "x" if factor.operation == "times" else " or ".join(addressed)
         return Bound(factor, unit, mask, int(mask.sum()), identity, smallest)
 
     @staticmethod
