@@ -22,6 +22,7 @@ JOINTS = tuple(f"{leg}_{joint}" for leg in FEET for joint in ("hip", "thigh", "c
 HOME = np.array([0.0, 0.9, -1.8] * 4)  # rad, the model's keyframe "home"
 ACTION_SCALE = 0.3  # rad
 FOOT_RADIUS = 0.022  # m
+CLEARANCE = 0.04  # m, a foot that moves shall be lifted by this much
 SETTLE = 2.0  # s before the speed counts
 
 
@@ -51,6 +52,8 @@ class Walk:
     command: jax.Array  # () m/s
     air_time: jax.Array  # (4,) s since each foot left the ground
     landed: jax.Array  # (4,) s in the air, of the feet that touched down in this step, else 0
+    feet: jax.Array  # (4, 3) m, where the feet are
+    dragged: jax.Array  # () m/s, speed of the feet over ground, weighted by how little they are lifted
     steps: jax.Array  # () int32
     distance: jax.Array  # () m walked forward since the settling time
     counted: jax.Array  # () s over which
@@ -125,11 +128,17 @@ class Go2Walk(Environment):
         qpos = home + jnp.where(np.arange(home.size) >= 7, 0.05, 0) * jax.random.normal(joint_key, home.shape)
         qvel = 0.05 * jax.random.normal(velocity_key, (self.mj_model.nv,))
         zero, feet = jnp.zeros_like(command), jnp.zeros_like(qpos[:4])
-        return (
-            qpos,
-            qvel,
-            Walk(command, feet, feet, jnp.zeros((), jnp.int32), zero, zero),
+        task = Walk(
+            command=command,
+            air_time=feet,
+            landed=feet,
+            feet=jnp.zeros((4, 3), qpos.dtype),
+            dragged=zero,
+            steps=jnp.zeros((), jnp.int32),
+            distance=zero,
+            counted=zero,
         )
+        return qpos, qvel, task
 
     def read(self, data: Data, task: Walk):
         return {
@@ -157,7 +166,11 @@ class Go2Walk(Environment):
         return jnp.concatenate([velocity, 10 * data.qpos[2:3] - 2.7, 10 * heights, task.air_time])
 
     def advance(self, task: Walk, data: Data, action):
-        contact = data.geom_xpos[self._feet, 2] < FOOT_RADIUS + 0.003
+        feet = data.geom_xpos[self._feet]
+        clearance = feet[:, 2] - FOOT_RADIUS
+        contact = clearance < 0.003
+        speed = jnp.linalg.norm(feet[:, :2] - task.feet[:, :2], axis=1) / self.control_dt
+        low = jnp.clip(1 - clearance / CLEARANCE, 0, 1)
         air_time = task.air_time + self.control_dt
         steps = task.steps + 1
         counts = steps * self.control_dt > SETTLE
@@ -165,6 +178,9 @@ class Go2Walk(Environment):
             task,
             air_time=jnp.where(contact, 0, air_time),
             landed=jnp.where(contact & (task.air_time > 0), air_time, 0),
+            feet=feet,
+            # At the first step there is no foot position to compare with.
+            dragged=jnp.where(task.steps > 0, jnp.sum(low * speed), 0),
             steps=steps,
             distance=task.distance + jnp.where(counts, forward_speed(data) * self.control_dt, 0),
             counted=task.counted + jnp.where(counts, self.control_dt, 0),
@@ -188,6 +204,7 @@ class Go2Walk(Environment):
             - 0.01 * jnp.sum(jnp.square(action - last_action))
             - 0.1 * jnp.sum(jnp.square(bent))
             + 2.0 * jnp.sum(jnp.where(task.landed > 0, task.landed - 0.2, 0))
+            - 0.5 * task.dragged
         )
         return self.control_dt * rate
 

@@ -13,7 +13,7 @@ import numpy as np
 from simreal.environment import Environment
 from simreal.evaluation.evaluator import Draws, PolicyLike
 
-FRAMES_PER_SECOND = 25
+FRAMES_PER_SECOND = 12.5
 STILLS = 12
 
 
