@@ -67,7 +67,7 @@ def digest(arrays: dict[str, jax.Array]) -> jax.Array:
     bits = jnp.concatenate([_bits(arrays[name]) for name in sorted(arrays)])
     index = np.arange(1, bits.size + 1, dtype=np.uint32)
     lanes = np.stack([index * np.uint32(0x9E3779B1), index * np.uint32(0x85EBCA77)])
-    mixed = (bits ^ lanes) * jnp.uint32(0xC2B2AE3D)
+    mixed = (bits[None] ^ lanes) * jnp.uint32(0xC2B2AE3D)
     mixed = (mixed ^ (mixed >> 15)) * jnp.uint32(0x27D4EB2F)
     return jnp.sum(mixed ^ (mixed >> 16), axis=1, dtype=jnp.uint32)
 

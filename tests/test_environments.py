@@ -40,6 +40,14 @@ def test_shapes_names_and_units(name):
     assert set(moved.info) == {"truncation", "failed", "diverged", "success"}
 
 
+def test_no_rank_is_promoted_silently(name):
+    """With the C engine, that is in all of our own code: MJX and Brax rely on it."""
+    env = environment(name)
+    with jax.numpy_rank_promotion("raise"):
+        state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+        jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
+
+
 def test_actions_reach_controls_affinely(name):
     env = environment(name)
     zero, a, b = jnp.zeros(env.action_size), *random_actions(env, 2)[:, 0]
