@@ -5,6 +5,7 @@ JAX 0.10 removed. Run it with `python examples/brax_training.py`.
 """
 
 import functools
+from collections.abc import Mapping
 
 import simreal
 from simreal.brax_adapter import BraxEnv
@@ -17,7 +18,7 @@ def main(steps: int = 200_000) -> list[float]:
     env = simreal.make("cartpole_swingup", randomizer=simreal.Randomizer())
     history: list[float] = []
 
-    def progress(step, metrics):
+    def progress(step: int, metrics: Mapping[str, float]) -> None:
         history.append(float(metrics["eval/episode_reward"]))
         print(f"step {step:>8}  return {history[-1]:8.3f}")
 

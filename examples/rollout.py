@@ -16,8 +16,8 @@ def main() -> None:
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), WORLDS))
 
     @jax.jit
-    def run(state, key):
-        def step(state, key):
+    def run(state: simreal.State, key: jax.Array) -> tuple[simreal.State, jax.Array]:
+        def step(state: simreal.State, key: jax.Array) -> tuple[simreal.State, jax.Array]:
             action = jax.random.uniform(key, (WORLDS, env.action_size), minval=-1, maxval=1)
             state = jax.vmap(env.step)(state, action)
             return state, state.reward
@@ -33,8 +33,8 @@ def main() -> None:
     env = simreal.make("cartpole_swingup", engine="mjx", solver_iterations=1)
     start = env.reset(jax.random.PRNGKey(0))
 
-    def return_of(force):
-        def step(state, _):
+    def return_of(force: jax.Array) -> jax.Array:
+        def step(state: simreal.State, _: None) -> tuple[simreal.State, jax.Array]:
             state = env.step(state, force)
             return state, state.reward
 

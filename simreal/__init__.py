@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from simreal.environment import Environment, State
     from simreal.policy import load_policy
     from simreal.randomizer import Randomizer
-    from simreal.registry import make
+    from simreal.registry import make, register
     from simreal.world import World
 
 # XLA writes a page to stderr about made-up processor features whenever it loads a cached program.
@@ -29,7 +29,17 @@ _LAZY = {
     "register": "simreal.registry",
 }
 
-__all__ = ["Environment", "Randomizer", "State", "UserError", "World", "__version__", "load_policy", "make"]
+__all__ = [
+    "Environment",
+    "Randomizer",
+    "State",
+    "UserError",
+    "World",
+    "__version__",
+    "load_policy",
+    "make",
+    "register",
+]
 
 
 def __getattr__(name: str) -> Any:

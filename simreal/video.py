@@ -155,7 +155,7 @@ def _images(
             renderer.update_scene(data, camera=-1 if camera is None else camera)
             if geoms is not None:
                 geoms(renderer.scene, frame)
-            # Mirrors and shadows draw every mesh again: minutes instead of seconds where a CPU does the drawing.
+            # Mirrors and shadows draw every mesh again: minutes instead of seconds where a CPU draws.
             for flag in (mujoco.mjtRndFlag.mjRND_REFLECTION, mujoco.mjtRndFlag.mjRND_SHADOW):
                 renderer.scene.flags[flag] = False
             yield Image.fromarray(renderer.render())
