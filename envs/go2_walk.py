@@ -204,7 +204,7 @@ class Go2Walk(Environment):
             - 0.01 * jnp.sum(jnp.square(action - last_action))
             - 0.1 * jnp.sum(jnp.square(bent))
             + 2.0 * jnp.sum(jnp.where(task.landed > 0, task.landed - 0.2, 0))
-            - 0.5 * task.dragged
+            - 0.15 * task.dragged
         )
         return self.control_dt * rate
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 
@@ -27,6 +27,8 @@ from simreal.rollout import Ended, Rollout, RolloutState
 
 Metrics = dict[str, jax.Array]
 
+_COLLECT, _UPDATE, _NEXT = range(3)  # folded into a run's key: what its randomness is for
+
 _SD_FLOOR = 1e-2
 """Observations that hardly move in training are not blown up: see the traps in the design notes."""
 
@@ -38,7 +40,7 @@ class TrainingState:
     params: losses.PPONetworkParams
     optimizer: optax.OptState
     normalizer: running_statistics.RunningStatisticsState
-    rollout: RolloutState
+    rollout: RolloutState | tuple[()]  # () inside `update`, which does not touch it
     ranges: Ranges
     last_success: jax.Array  # (greedy worlds,) outcome of each one's last episode, NaN before the first
     key: jax.Array  # (2,) uint32
@@ -86,8 +88,10 @@ class Learner:
             clipping_epsilon_value=hyper.clip_value,
             vf_coefficient=hyper.value_cost,
         )
+        self._init = jax.jit(self._start)
         self._collect = jax.jit(self.collect, donate_argnums=0)
-        self._update = jax.jit(self.update, donate_argnums=(0, 1, 2))
+        self._update = jax.jit(self.update, donate_argnums=0)
+        self._summarise = jax.jit(_summarise)
 
     @property
     def steps_per_epoch(self) -> int:
@@ -96,6 +100,9 @@ class Learner:
 
     def init(self, seed: int) -> TrainingState:
         """The run before its first step."""
+        return self._init(np.uint32(seed))
+
+    def _start(self, seed: jax.Array) -> TrainingState:
         key, policy_key, value_key, world_key = jax.random.split(jax.random.PRNGKey(seed), 4)
         params = losses.PPONetworkParams(
             policy=self.networks.policy_network.init(policy_key),
@@ -112,36 +119,20 @@ class Learner:
             key=key,
             steps=jnp.zeros((), jnp.uint32),
         )
-        # A copy of each leaf: `epoch` donates them, and a buffer that two leaves share can only be given
-        # once. The explicit type takes away weak types, for which the first epoch would compile a program of
-        # its own.
-        return jax.tree.map(lambda x: jnp.array(x, dtype=jnp.result_type(x)), state)
+        # The explicit type takes away weak types, for which the first epoch would compile a second program.
+        return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x)), state)
 
     def epoch(self, state: TrainingState) -> tuple[TrainingState, Metrics]:
         """`iterations_per_epoch` times collect and update. The state passed in is used up."""
         rows = []
         for _ in range(self.config.learner.iterations_per_epoch):
-            key, collect_key, update_key = jax.random.split(state.key, 3)
             rollout, data, ended = self._collect(
-                state.rollout, state.params.policy, state.normalizer, state.ranges, collect_key
+                state.rollout, state.params.policy, state.normalizer, state.ranges, state.key
             )
-            params, optimizer_state, normalizer, row = self._update(
-                state.params, state.optimizer, state.normalizer, data, update_key
-            )
-            row |= self._episodes(ended)
-            last_success = _latest(state.last_success, ended, self.worlds)
+            learnt, row = self._update(dataclasses.replace(state, rollout=()), data, ended)
+            state = dataclasses.replace(learnt, rollout=rollout)
             rows.append(row)
-            state = dataclasses.replace(
-                state,
-                params=params,
-                optimizer=optimizer_state,
-                normalizer=normalizer,
-                rollout=rollout,
-                last_success=last_success,
-                key=key,
-                steps=state.steps + jnp.uint32(self.worlds * self.config.learner.unroll_length),
-            )
-        return state, self._summarise(rows, state)
+        return state, self._summarise(rows, state.last_success)
 
     # -- collect -------------------------------------------------------------------------------------------
 
@@ -181,7 +172,7 @@ class Learner:
             )
             return state, (jax.tree.map(lambda x: x[:learning], step), ended)
 
-        keys = jax.random.split(key, self.config.learner.unroll_length)
+        keys = jax.random.split(jax.random.fold_in(key, _COLLECT), self.config.learner.unroll_length)
         rollout, (data, ended) = jax.lax.scan(one_step, rollout, keys)
         final = {"state": rollout.env.obs, "privileged_state": rollout.env.privileged}
         # The loss reads only the last next observation, to bootstrap from.
@@ -191,9 +182,10 @@ class Learner:
     # -- update --------------------------------------------------------------------------------------------
 
     def update(
-        self, params: Any, optimizer_state: Any, normalizer: Any, data: types.Transition, key: jax.Array
-    ) -> tuple[Any, Any, Any, Metrics]:
-        """`epochs` passes of minibatch gradient steps over the collected data."""
+        self, state: TrainingState, data: types.Transition, ended: Ended
+    ) -> tuple[TrainingState, Metrics]:
+        """`epochs` passes of minibatch gradient steps over the data; `state` comes without its rollout."""
+        params, normalizer = state.params, state.normalizer
         hyper = self.config.learner
         old_values = self.networks.value_network.apply(normalizer, params.value, data.observation)
         data.extras["policy_extras"]["value"] = old_values
@@ -238,33 +230,21 @@ class Learner:
             keys = jax.random.split(loss_key, hyper.minibatches)
             return jax.lax.scan(gradient_step, carry, (jax.tree.map(split, data), keys))
 
-        learnt, metrics = jax.lax.scan(
-            one_pass, (params, optimizer_state), jax.random.split(key, hyper.epochs)
+        pass_keys = jax.random.split(jax.random.fold_in(state.key, _UPDATE), hyper.epochs)
+        (params, optimizer_state), metrics = jax.lax.scan(one_pass, (params, state.optimizer), pass_keys)
+        learnt = dataclasses.replace(
+            state,
+            params=params,
+            optimizer=optimizer_state,
+            # After the passes: the old distribution parameters stay comparable for the divergence.
+            normalizer=running_statistics.update(normalizer, observation, std_min_value=_SD_FLOOR),
+            last_success=_latest(state.last_success, ended, self.worlds),
+            key=jax.random.fold_in(state.key, _NEXT),
+            steps=state.steps + jnp.uint32(self.worlds * hyper.unroll_length),
         )
-        params, optimizer_state = learnt
-        # After the passes: the old distribution parameters stay comparable for the divergence.
-        normalizer = running_statistics.update(normalizer, observation, std_min_value=_SD_FLOOR)
-        skipped = jnp.sum(metrics.pop("skipped_updates"))
-        summary = {name: jnp.mean(metrics[name]) for name in _REPORTED.values()}
-        return params, optimizer_state, normalizer, summary | {"skipped_updates": skipped}
-
-    # -- metrics -------------------------------------------------------------------------------------------
-
-    def _episodes(self, ended: Ended) -> Metrics:
-        return _count_episodes(ended, self.worlds)
-
-    def _summarise(self, rows: list[Mapping[str, jax.Array]], state: TrainingState) -> Metrics:
-        total = {name: jnp.sum(jnp.stack([row[name] for row in rows])) for name in rows[0]}
-        episodes = total["episodes"]
-        metrics = {name: total[source] / len(rows) for name, source in _REPORTED.items()}
-        return metrics | {
-            "episode_return": total["returns"] / episodes,
-            "success_rate": jnp.nanmean(state.last_success),
-            "exploring_success_rate": total["successes"] / episodes,
-            "episodes": episodes,
-            "diverged": total["diverged"],
-            "skipped_updates": total["skipped_updates"],
-        }
+        row = {name: jnp.mean(metrics[source]) for name, source in _REPORTED.items()}
+        row["skipped_updates"] = jnp.sum(metrics["skipped_updates"])
+        return learnt, row | _count_episodes(ended, self.worlds)
 
     def export(self, state: TrainingState) -> Policy:
         """The policy as it would run on a robot: NumPy only."""
@@ -281,7 +261,24 @@ _REPORTED = {
 """Name in metrics.jsonl -> name in Brax's loss."""
 
 
-@functools.partial(jax.jit, static_argnums=1)
+def _summarise(rows: list[Metrics], last_success: jax.Array) -> Metrics:
+    """One row for an epoch: means over its updates, sums and rates over its episodes."""
+    total = {name: jnp.sum(jnp.stack([row[name] for row in rows])) for name in rows[0]}
+    episodes = total.pop("episodes")
+    returns, successes = total.pop("returns"), total.pop("successes")
+    means = {name: total[name] / len(rows) for name in _REPORTED}
+    return (
+        total
+        | means
+        | {
+            "episode_return": returns / episodes,
+            "success_rate": jnp.nanmean(last_success),
+            "exploring_success_rate": successes / episodes,
+            "episodes": episodes,
+        }
+    )
+
+
 def _count_episodes(ended: Ended, learning: int) -> Metrics:
     """Sums over the episodes that ended in learning worlds."""
     done = ended.done[:, :learning]
@@ -293,7 +290,6 @@ def _count_episodes(ended: Ended, learning: int) -> Metrics:
     }
 
 
-@functools.partial(jax.jit, static_argnums=2)
 def _latest(last_success: jax.Array, ended: Ended, learning: int) -> jax.Array:
     """The outcome of each greedy world's latest episode."""
 
