@@ -23,6 +23,7 @@ HOME = np.array([0.0, 0.9, -1.8] * 4)  # rad, the model's keyframe "home"
 ACTION_SCALE = 0.3  # rad
 FOOT_RADIUS = 0.022  # m
 CLEARANCE = 0.04  # m, a foot that moves shall be lifted by this much
+STANCE = 0.35  # s, a foot that stands longer than this is not stepping
 SETTLE = 2.0  # s before the speed counts
 
 
@@ -52,6 +53,7 @@ class Walk:
     command: jax.Array  # () m/s
     air_time: jax.Array  # (4,) s since each foot left the ground
     landed: jax.Array  # (4,) s in the air, of the feet that touched down in this step, else 0
+    stance_time: jax.Array  # (4,) s since each foot last left the ground
     feet: jax.Array  # (4, 3) m, where the feet are
     dragged: jax.Array  # () m/s, speed of the feet over ground, weighted by how little they are lifted
     steps: jax.Array  # () int32
@@ -132,6 +134,7 @@ class Go2Walk(Environment):
             command=command,
             air_time=feet,
             landed=feet,
+            stance_time=feet,
             feet=jnp.zeros((4, 3), qpos.dtype),
             dragged=zero,
             steps=jnp.zeros((), jnp.int32),
@@ -173,11 +176,12 @@ class Go2Walk(Environment):
         low = jnp.clip(1 - clearance / CLEARANCE, 0, 1)
         air_time = task.air_time + self.control_dt
         steps = task.steps + 1
-        counts = steps * self.control_dt > SETTLE
+        counts = steps > round(SETTLE / self.control_dt)
         return dataclasses.replace(
             task,
             air_time=jnp.where(contact, 0, air_time),
             landed=jnp.where(contact & (task.air_time > 0), air_time, 0),
+            stance_time=jnp.where(contact, task.stance_time + self.control_dt, 0),
             feet=feet,
             # At the first step there is no foot position to compare with.
             dragged=jnp.where(task.steps > 0, jnp.sum(low * speed), 0),
@@ -204,7 +208,8 @@ class Go2Walk(Environment):
             - 0.01 * jnp.sum(jnp.square(action - last_action))
             - 0.1 * jnp.sum(jnp.square(bent))
             + 2.0 * jnp.sum(jnp.where(task.landed > 0, task.landed - 0.2, 0))
-            - 0.15 * task.dragged
+            - 0.1 * task.dragged
+            - 0.4 * jnp.sum(jnp.clip(task.stance_time - STANCE, 0, 0.5))
         )
         return self.control_dt * rate
 
