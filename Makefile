@@ -32,11 +32,11 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: $(STAMP)
 	$(BIN)/simreal train arm_reach --out runs/demo $(call resume,runs/demo)
-	$(BIN)/simreal evaluate runs/demo
+	$(BIN)/simreal evaluate runs/demo --require 'train.success>=0.95'
 
 demo-go2: $(STAMP)
 	$(BIN)/simreal train go2_walk --out runs/demo-go2 $(call resume,runs/demo-go2)
-	$(BIN)/simreal evaluate runs/demo-go2
+	$(BIN)/simreal evaluate runs/demo-go2 --require 'train.success>=0.9'
 
 test: $(STAMP)
 	$(BIN)/python -m pytest

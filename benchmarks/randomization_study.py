@@ -14,6 +14,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from simreal.checkpoints import Checkpoints
 from simreal.config_files import load_config
 from simreal.evaluation.statistics import paired_seed_interval, seed_interval
 from simreal.registry import environment_class
@@ -45,8 +46,7 @@ def _trained(out: Path, steps: int) -> bool:
     """Whether a run folder holds a policy that has seen all its steps."""
     if not (out / "policy").is_dir():
         return False
-    rows = Run.open(out).metrics()
-    return bool(rows) and rows[-1]["step"] >= steps
+    return max(Checkpoints(Run.open(out).checkpoints).steps(), default=0) >= steps
 
 
 def table(environment: str, results: dict[str, list[dict]]) -> str:

@@ -23,6 +23,7 @@ HOME = np.array([0.0, 0.9, -1.8] * 4)  # rad, the model's keyframe "home"
 ACTION_SCALE = 0.3  # rad
 FOOT_RADIUS = 0.022  # m
 CLEARANCE = 0.04  # m, a foot that moves shall be lifted by this much
+TOUCH = 0.003  # m, a foot closer to the floor than this stands on it
 STANCE = 0.35  # s, a foot that stands longer than this is not stepping
 SETTLE = 2.0  # s before the speed counts
 
@@ -171,7 +172,7 @@ class Go2Walk(Environment):
     def advance(self, task: Walk, data: Data, action):
         feet = data.geom_xpos[self._feet]
         clearance = feet[:, 2] - FOOT_RADIUS
-        contact = clearance < 0.003
+        contact = clearance < TOUCH
         speed = jnp.linalg.norm(feet[:, :2] - task.feet[:, :2], axis=1) / self.control_dt
         low = jnp.clip(1 - clearance / CLEARANCE, 0, 1)
         air_time = task.air_time + self.control_dt
@@ -208,6 +209,7 @@ class Go2Walk(Environment):
             - 0.01 * jnp.sum(jnp.square(action - last_action))
             - 0.1 * jnp.sum(jnp.square(bent))
             + 2.0 * jnp.sum(jnp.where(task.landed > 0, task.landed - 0.2, 0))
+            + 0.5 * trot(data.geom_xpos[self._feet, 2] < FOOT_RADIUS + TOUCH)
             - 0.1 * task.dragged
             - 0.4 * jnp.sum(jnp.clip(task.stance_time - STANCE, 0, 0.5))
         )
@@ -227,6 +229,16 @@ def to_body(quaternion: jax.Array, vector: jax.Array) -> jax.Array:
     w, axis = quaternion[0], -quaternion[1:]
     twice = 2 * jnp.cross(axis, vector)
     return vector + w * twice + jnp.cross(axis, twice)
+
+
+def trot(contact: jax.Array) -> jax.Array:
+    """How much the feet (4,) in contact are those of a trot, 0 to 1: diagonal pairs together, and in turns.
+
+    After the gait rewards of Isaac Lab's quadrupeds, without their clock.
+    """
+    front_right, front_left, rear_right, rear_left = contact
+    together = (front_right == rear_left) & (front_left == rear_right)
+    return jnp.asarray(together & (front_right != front_left), float)
 
 
 def forward_speed(data: Data) -> jax.Array:

@@ -9,6 +9,7 @@ Elements are addressed by their names in the model, or by patterns over them.
 
 from __future__ import annotations
 
+from simreal.errors import UserError
 from simreal.factors import Target, target
 
 
@@ -24,6 +25,8 @@ def body_inertia(*bodies: str) -> Target:
 
 def body_com(*bodies: str, axis: str = "x") -> Target:
     """Centre of mass of bodies along one axis of the body frame (m)."""
+    if axis not in ("x", "y", "z"):
+        raise UserError(f"body_com: axis {axis!r}; valid: x, y, z")
     return target("physics", "body_com", bodies, axis=axis)
 
 
@@ -64,6 +67,8 @@ def gravity() -> Target:
 
 def gravity_tilt(axis: str = "x") -> Target:
     """Tilt of the floor about a horizontal axis (rad), applied as the opposite turn of gravity."""
+    if axis not in ("x", "y"):
+        raise UserError(f"gravity_tilt: axis {axis!r}; valid: x, y")
     return target("physics", "gravity_tilt", axis=axis)
 
 

@@ -42,6 +42,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("simreal: interrupted before anything was saved in this call", file=sys.stderr)
         return INTERRUPTED
+    except PermissionError as error:
+        print(f"simreal: {error.filename}: {error.strerror}", file=sys.stderr)
+        return WRONG_INPUT
     except BrokenPipeError:  # the reader, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE

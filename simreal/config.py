@@ -153,7 +153,7 @@ class RunConfig:
     """Seed of everything random in the run."""
     worlds: PositiveInt = 512
     """Worlds that are stepped in parallel and learnt from."""
-    steps: PositiveInt = 3_000_000
+    steps: Annotated[int, Field(gt=0, lt=2**32)] = 3_000_000
     """Environment steps after which training ends."""
     target_success: Annotated[float, Field(gt=0, le=1)] | None = None
     """Success rate of the mean action at which training ends before that; null trains through all steps."""

@@ -27,7 +27,7 @@ from simreal import sensors as sensors_module
 from simreal.actuators import Actuators, ActuatorState
 from simreal.engines import Data, Inputs, Physics, engine_class, resolve
 from simreal.errors import UserError, nearest
-from simreal.quantities import control_units, element_names
+from simreal.quantities import QUANTITIES, control_units, element_names
 from simreal.randomizer import ParameterGroup, Randomizer, Ranges, WorldBuilder
 from simreal.sensors import Sensors, SensorState
 from simreal.world import World
@@ -35,7 +35,7 @@ from simreal.world import World
 Task = Any
 """Whatever a task carries through an episode: a target, a command, timers. A pytree of arrays."""
 
-MAX_SPEED = 1e6
+MAX_SPEED = 1e3
 """A generalised velocity beyond this (rad/s or m/s) counts as blown up."""
 
 
@@ -236,6 +236,13 @@ class Environment(abc.ABC):
             "no_load_speed": (undriven, undriven_reason),
             "thermal_limit": (undriven, undriven_reason),
             "backlash": (~servo, "is play of a position command; {name!r} is no position actuator"),
+            "force_limit": (
+                model.actuator_forcelimited == 0,
+                "needs a forcerange, which {name!r} has none of",
+            ),
+            "kp": (~servo, "is a position gain; {name!r} is no position actuator"),
+            "kv": (model.actuator_biastype == 0, "is a velocity gain; {name!r} has none"),
+            "joint_range": (model.jnt_limited == 0, "cannot vary on {name!r}, which has no range"),
             "deadband": (servo, "is for torque and speed commands; {name!r} is a position actuator"),
         }
         for factor, bound in self.randomizer.bound.items():
@@ -244,7 +251,8 @@ class Environment(abc.ABC):
                 self.check_delay(f"factor {factor!r}", bound.factor.distribution.support()[1])
             if quantity in refusals:
                 refused, reason = refusals[quantity]
-                names = element_names(model, "body") if quantity == "body_com" else self.actuators.names
+                element = QUANTITIES[quantity].element if quantity in QUANTITIES else "actuator"
+                names = element_names(model, element)
                 rows = np.flatnonzero(bound.mask & refused)
                 if rows.size:
                     raise UserError(f"factor {factor!r}: {quantity} {reason.format(name=names[rows[0]])}")

@@ -212,7 +212,7 @@ def _run_range(
         name=RANGE,
         description=worldset.description,
         claims_outside=False,
-        digest=digest(worldset, draws),
+        digest=digest(worldset, draws, evaluator.seed),
         draws=draws,
         **{name: outcome[name] for name in ("episode_return", "success", "steps", "ended_by")},
         hardware={name: outcome[name] for name in HARDWARE},

@@ -31,6 +31,10 @@ class PolicyInterface:
     """(name, unit) of each number, in order."""
     actions: Sequence[str]
     """Actuator of each number, in order."""
+    action_units: Sequence[str]
+    """Unit of each actuator's control."""
+    control_limits: Sequence[Sequence[float]]
+    """(lowest, highest) control of each actuator."""
     control_offset: Sequence[float]
     """Actuator control of action 0."""
     control_scale: Sequence[float]
@@ -74,6 +78,8 @@ class Policy:
     @classmethod
     def from_training(cls, env: Any, config: Any, policy_params: Any, normalizer: Any) -> Policy:
         """Takes the policy out of a training state."""
+        from simreal.quantities import control_units  # needs MuJoCo, which a robot may not have
+
         tree = policy_params["params"]
         hidden = tree.get("MLP_0", {})
         layers = [hidden[f"hidden_{i}"] for i in range(len(hidden))] + [tree["Dense_0"]]
@@ -89,6 +95,8 @@ class Policy:
             control_dt=env.control_dt,
             observations=[list(o) for o in env.observations],
             actions=list(env.actuators.names),
+            action_units=control_units(env.mj_model),
+            control_limits=[[float(low), float(high)] for low, high in env.mj_model.actuator_ctrlrange],
             control_offset=offset.tolist(),
             control_scale=(np.asarray(env.control(zero + 1)) - offset).tolist(),
             activation=config.network.activation,

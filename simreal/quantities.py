@@ -36,8 +36,6 @@ class Quantity:
     lowest: float = -np.inf
     """The value after the operation may not be below this (or not at it, with `strict`)."""
     strict: bool = False
-    joint_types: tuple[int, ...] | None = None
-    """For joints and dofs: the joint types that have it; None for all."""
 
 
 def _scalar(field: str, column: int | None = None) -> Apply:
@@ -144,7 +142,7 @@ QUANTITIES: dict[str, Quantity] = {
     "friction_loss": Quantity("dof", ("dof_frictionloss",), "N m", _scalar("dof_frictionloss"), lowest=0),
     "armature": Quantity("dof", ("dof_armature",), "kg m2", _scalar("dof_armature"), lowest=0),
     "stiffness": Quantity("joint", ("jnt_stiffness",), "N m/rad", _scalar("jnt_stiffness"), lowest=0),
-    "joint_range": Quantity("joint", ("jnt_range",), "rad", _joint_range, joint_types=_SLIDERS),
+    "joint_range": Quantity("joint", ("jnt_range",), "rad", _joint_range),
     "gravity": Quantity("option", ("opt.gravity",), "m/s2", _gravity, lowest=0),
     "gravity_tilt": Quantity("option", ("opt.gravity",), "rad", _gravity_tilt, ("plus", "set")),
     "kp": Quantity("actuator", _ACTUATOR, "N m/rad", _kp, lowest=0, strict=True),

@@ -73,7 +73,7 @@ class Randomizer:
     @property
     def digest(self) -> str:
         """SHA-256 over names, targets, operations and distributions: equal digests draw the same worlds."""
-        text = "\n".join(f"{name}={factor}" for name, factor in sorted(self.factors.items()))
+        text = "\n".join(f"{name}={factor}" for name, factor in self.factors.items())
         return hashlib.sha256(text.encode()).hexdigest()
 
     def __repr__(self) -> str:
@@ -107,8 +107,8 @@ class Bound:
     mask: np.ndarray  # (rows,) bool
     size: int
     """Number of draws: 1, or one per addressed element."""
-    nominal: float
-    """The draw that changes nothing."""
+    nominal: float | np.ndarray
+    """The draw that changes nothing; NaN where no single draw does (`set` over unequal nominal values)."""
     lowest: float
     """Smallest draw that leaves every addressed value possible."""
 
@@ -123,7 +123,7 @@ class Bound:
 
         def apply(values: jax.Array) -> jax.Array:
             spread = draw.astype(values.dtype)[position] if draw.ndim else draw.astype(values.dtype)
-            return jnp.where(self.mask, operation(values, spread), values)
+            return jnp.where(self.mask & ~jnp.isnan(spread), operation(values, spread), values)
 
         return apply
 
@@ -163,6 +163,7 @@ class WorldBuilder:
         physics = [b.factor for b in self.bound.values() if b.factor.target.group == "physics"]
         varied = sorted({field for f in physics for field in QUANTITIES[f.target.quantity].fields})
         self._nominal = {name: nominal_field(model, name) for name in varied}
+        self._check_combinations()
         self._derive = derived_constants(model, varied)
         self.events = tuple(name for name, b in self.bound.items() if b.factor.time is not None)
         self.model_fields = tuple(sorted(jax.eval_shape(lambda: self.build({}).model)))
@@ -218,7 +219,7 @@ class WorldBuilder:
 
     def nominal_draws(self) -> dict[str, jax.Array]:
         """The draws that change nothing; events happen never."""
-        draws = {name: jnp.full(b.shape, b.nominal, dtype=float) for name, b in self.bound.items()}
+        draws = {n: jnp.broadcast_to(jnp.asarray(b.nominal, float), b.shape) for n, b in self.bound.items()}
         return draws | {f"{name}_time": jnp.asarray(jnp.inf, dtype=float) for name in self.events}
 
     def complete(self, draws: Mapping[str, Any]) -> dict[str, jax.Array]:
@@ -315,19 +316,45 @@ class WorldBuilder:
             if values.size == 1 and len(names) != 1:
                 names = ["*"]
         mask = np.array([target.matches(n) or n == "*" for n in names], dtype=bool)
-        if not mask.any():
-            raise UserError(f"{where}: addresses nothing; {nearest(target.patterns[0], _valid_names(names))}")
+        for pattern in target.patterns:
+            if not any(replace(target, patterns=(pattern,)).matches(n) or n == "*" for n in names):
+                raise UserError(
+                    f"{where}: {pattern!r} addresses nothing; {nearest(pattern, _valid_names(names))}"
+                )
         if factor.operation not in operations:
             raise UserError(f"{where}: cannot {factor.operation}; valid: {', '.join(operations)}")
         nominal = values[mask]
         _check_support(where, factor, nominal, lowest, strict)
-        identity = _IDENTITY.get(factor.operation, float(nominal[0]))
+        identity = _IDENTITY.get(factor.operation, _nominal_draw(nominal, factor.independent))
         size = float(np.max(np.abs(nominal), where=np.isfinite(nominal), initial=1e-3))
         least = lowest + (1e-3 * size if strict else 0.0)
         smallest = {"times": 1e-3, "plus": least - float(np.min(nominal)), "set": least}[factor.operation]
         addressed = dict.fromkeys(itertools.compress(units, mask))
         unit = "x" if factor.operation == "times" else " or ".join(addressed)
         return Bound(factor, unit, mask, int(mask.sum()), identity, smallest)
+
+    def _check_combinations(self) -> None:
+        """Raises UserError where factors that share a field make a value impossible together."""
+        users: dict[str, list[str]] = {}
+        for name, bound in self.bound.items():
+            if bound.factor.target.group == "physics":
+                users.setdefault(QUANTITIES[bound.factor.target.quantity].fields[0], []).append(name)
+        shared = {field: names for field, names in users.items() if len(names) > 1}
+        for field, names in shared.items():
+            quantity = QUANTITIES[self.bound[names[0]].factor.target.quantity]
+            if quantity.element == "actuator" or not math.isfinite(quantity.lowest):
+                continue
+            lowest = {n: self.bound[n].factor.distribution.support()[0] for n in names}
+            fields = {name: jnp.asarray(value, dtype=float) for name, value in self._nominal.items()}
+            for n in names:
+                target = self.bound[n].factor.target
+                change = self.bound[n].change(jnp.asarray(lowest[n], dtype=float))
+                fields |= QUANTITIES[target.quantity].apply(fields, change, dict(target.options))
+            mask = np.any([self.bound[n].mask for n in names], axis=0)
+            values = np.asarray(fields[field])
+            least = float(np.min(values[mask] if values.ndim == 1 else values[mask, 0]))
+            if least < quantity.lowest or (quantity.strict and least <= quantity.lowest):
+                raise UserError(f"factors {' and '.join(names)}: together they may make {field} {least:g}")
 
     @staticmethod
     def _physical_values(model: mujoco.MjModel, target: Target) -> np.ndarray:
@@ -342,6 +369,13 @@ class WorldBuilder:
 
         quantity.apply({f: jnp.asarray(nominal_field(model, f)) for f in quantity.fields}, record, options)
         return seen[0]
+
+
+def _nominal_draw(nominal: np.ndarray, independent: bool) -> float | np.ndarray:
+    """The draw of `set` that leaves the addressed values (n,) as they are."""
+    if independent:
+        return nominal
+    return float(nominal[0]) if np.all(nominal == nominal[0]) else math.nan
 
 
 def _valid_names(names: list[str]) -> list[str]:

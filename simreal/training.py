@@ -161,8 +161,8 @@ class _Loop:
                     raise Interrupted(
                         f"interrupted; step {self.step:,} is saved, --resume --out {self.run.folder} goes on"
                     )
-        if self.saved_step != self.step or not self.run.policy.is_dir():
-            self.save()
+        # Always: a run that was killed between its last checkpoint and the export has an older policy.
+        self.save()
         self.progress.say(f"{self._ending()}; {self.run.folder} holds the policy")
 
     def epoch(self, began: float) -> dict[str, Any]:

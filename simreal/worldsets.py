@@ -106,9 +106,9 @@ def _tag(name: str) -> int:
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "little") & 0x7FFFFFFF
 
 
-def digest(worldset: WorldSet, draws: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 over a set's definition and its draws."""
-    content = hashlib.sha256(repr(worldset).encode())
+def digest(worldset: WorldSet, draws: Mapping[str, np.ndarray], seed: int) -> str:
+    """SHA-256 over a set's definition, its draws, and the seed of its start states and noise."""
+    content = hashlib.sha256(f"{worldset!r} {seed}".encode())
     for name in sorted(draws):
         content.update(name.encode())
         content.update(np.ascontiguousarray(draws[name], np.float32).tobytes())
@@ -121,7 +121,7 @@ TRAIN = WorldSet("train", "fresh draws from the training ranges", "train")
 
 def held_out(**outside: Sequence[Interval]) -> WorldSet:
     """The `held_out` set: each factor outside its training range in turn, and all together."""
-    text = "each factor outside its training range in turn, and all together"
+    text = f"each of {len(outside)} factors outside its training range in turn, and all together"
     return WorldSet("held_out", text, "outside", outside=outside)
 
 

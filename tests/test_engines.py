@@ -202,6 +202,18 @@ def test_a_varied_friction_loss_is_not_compiled_away_on_mjx():
     assert speeds[0] == pytest.approx(speeds[1], abs=1e-3)
 
 
+def test_a_reset_does_not_remember_what_the_row_did_before():
+    """The host keeps its rows between calls: state, forces and pushes of the last call must not show."""
+    env = environment("arm_reach")
+    world = env.randomizer.build({})
+    start = env.engine.initial(jnp.array([0.3, 0.8]), jnp.zeros(2))
+    fresh = env.engine.forward(world, start)
+    env.engine.step(world, start, Inputs(jnp.full((1, 2), 15.0), {}))
+    again = env.engine.forward(world, start)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.array_equal(a, b)), fresh, again))
+    assert not again.actuator_force.any()
+
+
 def test_unknown_engine():
     with pytest.raises(simreal.UserError, match="valid: auto, mujoco, mjx"):
         simreal.make("cartpole_swingup", engine="bullet")

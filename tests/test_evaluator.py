@@ -107,6 +107,12 @@ def test_a_factor_curve_and_a_heat_map_move_their_factors_only(arm, servo):
     assert heat.success.shape == (5, 5, 4)
 
 
+def test_a_factor_without_effect_gives_the_same_episodes_at_every_value(arm, servo):
+    """The worlds, starts and noise along a curve are paired; only the factor moves."""
+    inert = servo.run_factor("tilt", np.array([0.005, 0.005, 0.005]), 8)
+    np.testing.assert_array_equal(inert.episode_return[0], inert.episode_return[2])
+
+
 def test_unknown_sets_and_factors(arm, servo):
     with pytest.raises(simreal.UserError, match="did you mean 'held_out'"):
         choose_sets(arm, ["held-out"])

@@ -277,6 +277,33 @@ def test_impossible_factors_are_refused_in_one_line(case):
     assert "\n" not in str(caught.value)
 
 
+def test_one_unknown_name_among_known_ones_is_refused():
+    with pytest.raises(simreal.UserError, match="'lower_lnk' addresses nothing; did you mean 'lower_link'"):
+        simreal.make(
+            "arm_reach",
+            randomizer=simreal.Randomizer(
+                m=physics.body_mass("upper_link", "lower_lnk").times(Uniform(0.5, 1))
+            ),
+        )
+
+
+def test_factors_that_are_impossible_only_together_are_refused():
+    light, lighter = (physics.body_mass("tool") for _ in range(2))
+    with pytest.raises(simreal.UserError, match="together"):
+        simreal.make(
+            "arm_reach",
+            randomizer=simreal.Randomizer(a=light.times(Uniform(0.2, 1)), b=lighter.plus(Uniform(-0.2, 0))),
+        )
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_setting_unequal_nominal_values_leaves_the_nominal_world_nominal(each):
+    factor = physics.joint_damping("*").set(Uniform(0.5, 2))
+    env = simreal.make("arm_reach", randomizer=simreal.Randomizer(d=factor.each() if each else factor))
+    np.testing.assert_allclose(env.randomizer.build({}).model["dof_damping"], env.mj_model.dof_damping)
+    np.testing.assert_allclose(env.randomizer.build({"d": 1.5}).model["dof_damping"], [1.5, 1.5])
+
+
 def test_low_above_high_is_refused():
     with pytest.raises(ValueError, match="above high"):
         Uniform(2, 1)

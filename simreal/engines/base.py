@@ -95,6 +95,13 @@ class Engine(abc.ABC):
             # A limited force may need a control outside ctrlrange, which MuJoCo would clamp back; `limited`
             # clamps before it limits.
             self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
+        if model.nhistory > 0:
+            delayed = np.flatnonzero(model.actuator_delay > 0)
+            what = f"actuator {model.actuator(delayed[0]).name!r}" if delayed.size else "a sensor"
+            raise UserError(
+                f"the model gives {what} a delay, which mjx ignores and no World carries; remove it from the "
+                "MJCF and use the factors actuator.delay(...) and sensor.delay(...)"
+            )
         self.varied = varied
         self.data_fields = data_fields
         self.substeps = substeps

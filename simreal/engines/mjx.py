@@ -11,7 +11,6 @@ import numpy as np
 
 from simreal.constants import C_ONLY
 from simreal.engines.base import Data, Engine, Inputs, Physics, refuse_reverse_gradient
-from simreal.errors import UserError
 from simreal.quiet import import_mjx
 from simreal.world import World
 
@@ -29,12 +28,6 @@ class MjxEngine(Engine):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        if np.any(self.model.actuator_delay > 0):
-            names = [self.model.actuator(i).name for i in np.flatnonzero(self.model.actuator_delay > 0)]
-            raise UserError(
-                f"the model gives actuator {names[0]!r} a delay, which mjx ignores; remove it from the MJCF "
-                f"and use the factor actuator.delay({names[0]!r}), or engine='mujoco'"
-            )
         model = mujoco.MjModel.__copy__(self.model)
         if "dof_frictionloss" in self.varied:
             model.dof_frictionloss[:] = np.maximum(model.dof_frictionloss, _LIFTED)

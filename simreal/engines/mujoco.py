@@ -11,7 +11,6 @@ from __future__ import annotations
 import ctypes
 import dataclasses
 import functools
-import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,6 +23,7 @@ import numpy as np
 from mujoco import batch as mujoco_batch
 
 from simreal.engines.base import Data, Engine, Inputs, Physics, refuse_gradient
+from simreal.runs import cpu_affinity
 from simreal.world import World
 
 _STATE = ("time", "qpos", "qvel", "act", "qacc_warmstart")
@@ -33,7 +33,7 @@ class _Rows:
     """A Batch with the number of the World that each row's model fields were written from."""
 
     def __init__(self, engine: MujocoEngine, nsim: int) -> None:
-        self.batch = mujoco_batch.Batch(engine.model, nsim, nthread=len(os.sched_getaffinity(0)))
+        self.batch = mujoco_batch.Batch(engine.model, nsim, nthread=len(cpu_affinity()))
         self.numbers = np.zeros((nsim, 2), np.uint32)
         self.fresh = np.ones(nsim, bool)
         self.fields = {name: self.batch.expand(name) for name in engine.varied}
@@ -113,17 +113,21 @@ class MujocoEngine(Engine):
         with self._rows(number, model, physics) as (rows, lead, dtype):
             rows.state["ctrl"][:] = 0
             rows.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
-            return _collect(rows.outputs, lead, dtype)
+            out = _collect(rows.outputs, lead, dtype)
+            # No force has acted yet; the row still holds that of whatever it stepped last.
+            return out | {"actuator_force": np.zeros_like(out["actuator_force"])}
 
     def _host_step(self, number: Any, model: dict, physics: Physics, inputs: Inputs) -> dict[str, np.ndarray]:
         with self._rows(number, model, physics) as (rows, lead, dtype):
             n = rows.numbers.shape[0]
             controls = np.asarray(inputs.controls)
             controls = controls.reshape(n, controls.shape[-2], -1)
-            if rows.push is not None and inputs.push is not None:
-                rows.push[:, self.push_body, :3] = np.asarray(inputs.push).reshape(n, 3)
-            if rows.timestep is not None and inputs.period_scale is not None:
-                rows.timestep[:] = self.model.opt.timestep * np.asarray(inputs.period_scale).reshape(n)
+            if rows.push is not None:
+                push = 0.0 if inputs.push is None else np.asarray(inputs.push).reshape(n, 3)
+                rows.push[:, self.push_body, :3] = push
+            if rows.timestep is not None:
+                scale = 1.0 if inputs.period_scale is None else np.asarray(inputs.period_scale).reshape(n)
+                rows.timestep[:] = self.model.opt.timestep * scale
             limits = {k: np.asarray(v).reshape(n, -1) for k, v in inputs.limits.items()}
             self._advance(rows, controls, limits)
             return _collect({**{k: rows.state[k] for k in _STATE}, **rows.outputs}, lead, dtype)

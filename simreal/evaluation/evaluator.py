@@ -25,6 +25,8 @@ Note = Callable[[str], None]
 
 HARDWARE = ("peak_torque", "saturated_share", "power", "action_rate")
 HEAT_MAP_POINTS = 5
+POLICY_KEY = 0x706F6C
+"""Folded into a world's key for the policy; small numbers would give keys that the environment's split uses."""
 
 
 class PolicyLike(Protocol):
@@ -66,7 +68,7 @@ class Evaluator:
             name=worldset.name,
             description=worldset.description,
             claims_outside=worldset.claims_outside,
-            digest=digest(worldset, draws),
+            digest=digest(worldset, draws, self.seed),
             draws=draws,
             **{k: outcome[k] for k in ("episode_return", "success", "steps", "ended_by")},
             hardware={name: outcome[name] for name in HARDWARE},
@@ -82,7 +84,7 @@ class Evaluator:
         if factor not in builder.bound:
             raise UserError(f"unknown factor {factor!r}; {nearest(factor, builder.bound)}")
         base = TRAIN.draws(builder, worlds, self.seed)
-        outcome = self.run(_cross(base, {factor: values}))
+        outcome = self.run(_cross(base, {factor: values}), np.tile(np.arange(worlds), len(values)))
         low, high = builder.bound[factor].factor.distribution.range()
         shape = (len(values), worlds)
         return FactorCurve(
@@ -110,19 +112,24 @@ class Evaluator:
         ordered = sorted(curves, key=lambda n: float(np.ptp(curves[n].success.mean(axis=1))), reverse=True)
         x, y = ordered[:2]
         values = {n: sweep_values(self.env, n, HEAT_MAP_POINTS) for n in (x, y)}
-        outcome = self.run(_cross(TRAIN.draws(self.env.randomizer, worlds, self.seed), values))
+        crossed = _cross(TRAIN.draws(self.env.randomizer, worlds, self.seed), values)
+        index = np.tile(np.arange(worlds), len(values[x]) * len(values[y]))
+        outcome = self.run(crossed, index)
         success = outcome["success"].reshape(len(values[x]), len(values[y]), worlds)
         return HeatMap(x, y, values[x], values[y], success)
 
-    def run(self, draws: Draws) -> dict[str, np.ndarray]:
-        """One episode in each of n worlds given by their draws, factor -> (n, ...). All results are (n,)."""
+    def run(self, draws: Draws, index: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """One episode in each of n worlds given by their draws, factor -> (n, ...). All results are (n,).
+
+        Worlds with the same `index` (n,) share start state and noise; default: each has its own.
+        """
         worlds = len(next(iter(draws.values()))) if draws else self.batch
+        index = np.arange(worlds) if index is None else index
         parts = []
         for begin in range(0, worlds, self.batch):
-            index = np.minimum(np.arange(begin, begin + self.batch), worlds - 1)
-            built = self._build({name: jnp.asarray(value[index]) for name, value in draws.items()})
-            # Worlds with the same index in their set share start state and noise.
-            parts.append(self._episodes(built, jnp.asarray(index)))
+            rows = np.minimum(np.arange(begin, begin + self.batch), worlds - 1)
+            built = self._build({name: jnp.asarray(value[rows]) for name, value in draws.items()})
+            parts.append(self._episodes(built, jnp.asarray(index[rows])))
         joined = jax.tree.map(lambda *x: np.concatenate([np.asarray(p) for p in x])[:worlds], *parts)
         joined["success"] = joined["success"] > 0
         return joined
@@ -152,7 +159,7 @@ class Evaluator:
 
         def one_step(carry: tuple) -> tuple:
             state, memory, totals, alive, count = carry
-            policy_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(state.key, 1)
+            policy_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(state.key, POLICY_KEY)
             action, memory = jax.vmap(self.policy)(state.obs, memory, policy_keys)
             state = jax.vmap(self.env.step)(state, action)
             return state, memory, _accumulate(totals, state, alive), alive & (state.done == 0), count + 1

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from simreal.environment import Environment
-from simreal.evaluation.evaluator import Draws, PolicyLike
+from simreal.evaluation.evaluator import POLICY_KEY, Draws, PolicyLike
 
 FRAMES_PER_SECOND = 12.5
 STILLS = 12
@@ -34,7 +34,7 @@ def record(env: Environment, policy: PolicyLike, draws: Draws, index: int, seed:
 
     @jax.jit
     def act(state: Any, memory: Any) -> tuple[Any, Any]:
-        return policy(state.obs, memory, jax.random.fold_in(state.key, 1))
+        return policy(state.obs, memory, jax.random.fold_in(state.key, POLICY_KEY))
 
     state, memory = reset(key, world), policy.initial_state()
     qpos, tasks = [state.physics.qpos], [state.task]
