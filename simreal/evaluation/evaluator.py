@@ -26,7 +26,7 @@ Note = Callable[[str], None]
 HARDWARE = ("peak_torque", "saturated_share", "power", "action_rate")
 HEAT_MAP_POINTS = 5
 POLICY_KEY = 0x706F6C
-"""Folded into a world's key for the policy; small numbers would give keys that the environment's split uses."""
+"""Folded into a world's key for the policy; small numbers give keys that the environment's split uses."""
 
 
 class PolicyLike(Protocol):
