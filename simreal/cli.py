@@ -160,6 +160,9 @@ def _build_evaluate(parser: argparse.ArgumentParser) -> None:
         metavar="CONDITION",
         help="exit with 3 unless it holds, as in 'held_out.success>=0.9'; may be repeated",
     )
+    parser.add_argument(
+        "--against", type=Path, metavar="RUN", help="compare with this run on the same worlds, in the report"
+    )
     parser.add_argument("--json", action="store_true", help="print transfer.json instead of a table")
 
 
@@ -167,7 +170,7 @@ def _evaluate(given: argparse.Namespace) -> int:
     from simreal import evaluating
 
     request = evaluating.Request.parse(
-        given.run, given.sets, given.ranges, given.worlds, given.engine, given.require
+        given.run, given.sets, given.ranges, given.worlds, given.engine, given.require, given.against
     )
     _set_up_jax()
     failures = evaluating.evaluate(request, as_json=given.json)

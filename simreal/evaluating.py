@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
@@ -42,6 +42,8 @@ class Request:
     worlds: int | None
     engine: str | None
     requirements: tuple[Requirement, ...]
+    against: Run | None = None
+    """Another run of the same environment, whose policy meets the same worlds."""
 
     @classmethod
     def parse(
@@ -52,6 +54,7 @@ class Request:
         worlds: int | None = None,
         engine: str | None = None,
         require: Sequence[str] = (),
+        against: Path | None = None,
     ) -> Request:
         """Reads the arguments of the command line.
 
@@ -63,13 +66,20 @@ class Request:
         names = None if sets is None else tuple(name.strip() for name in sets.split(",") if name.strip())
         if names == ():
             raise UserError("--sets: names no set")
+        opened, rival = Run.open(run), Run.open(against) if against is not None else None
+        if rival is not None and rival.config().environment != opened.config().environment:
+            raise UserError(
+                f"--against {against}: a run of {rival.config().environment}; "
+                f"{run} is one of {opened.config().environment}"
+            )
         return cls(
-            Run.open(run),
+            opened,
             names,
             dict(_parse_range(text) for text in ranges),
             worlds,
             engine,
             tuple(requirements.parse_requirement(text) for text in require),
+            rival,
         )
 
 
@@ -91,6 +101,7 @@ def evaluate(request: Request, as_json: bool = False) -> list[str]:
         run = request.run
         content = transfer(evaluation)
         write_transfer(content, run.folder / "transfer.json")
+        comparison = _compare(request, evaluation, status.update)
         video = _film(request, evaluation, status.update)
         status.update("writing the report")
         page = write_report(
@@ -102,6 +113,7 @@ def evaluate(request: Request, as_json: bool = False) -> list[str]:
             run.config_file.read_text(encoding="utf-8"),
             shlex.join(["simreal", *sys.argv[1:]]),
             video,
+            comparison,
         )
     print(json.dumps(content, indent=2) if as_json else f"{terminal_table(content)}\n\nreport: {page}")
     return requirements.check(request.requirements, content)
@@ -151,6 +163,26 @@ def evaluate_run(request: Request, note: Note = lambda text: None) -> Evaluation
         factors=curves,
         heat_map=heat_map,
     )
+
+
+def _compare(request: Request, evaluation: Evaluation, note: Note) -> dict[str, Any] | None:
+    """The other run's policy on the same sets, set by set; None without another run."""
+    if request.against is None:
+        return None
+    from simreal.evaluation.evaluator import Evaluator, choose_sets
+    from simreal.evaluation.transfer import compare
+    from simreal.policy import load_policy
+    from simreal.training import make_environment
+
+    env = make_environment(request.run.config(), evaluation.engine)
+    rival = Evaluator(env, load_policy(request.against.folder), evaluation.seed)
+    results = {}
+    for worldset in choose_sets(env, [name for name in evaluation.sets if name != RANGE]):
+        note(f"{request.against.folder.name} on {worldset.name}")
+        results[worldset.name] = rival.run_set(worldset, len(evaluation.sets[worldset.name].success))
+    other = dataclasses.replace(evaluation, run=str(request.against.folder), sets=results, factors={})
+    labels = [f"{run.folder.name} ({run.config().randomization})" for run in (request.run, request.against)]
+    return compare(evaluation, other, (labels[0], labels[1]))
 
 
 def _film(request: Request, evaluation: Evaluation, note: Note) -> Path | None:

@@ -70,6 +70,7 @@ BAD_EVALUATION = {
     "range of an unknown factor": (["--range", "link_mas=1:2"], "link_mass"),
     "range with low above high": (["--range", "link_mass=2:1"], "low 2 is above high 1"),
     "range of negative masses": (["--range", "link_mass=-2:1"], "link_mass"),
+    "comparison with nothing": (["--against", "gone"], "no run in 'gone'"),
     "no worlds": (["--worlds", "0"], "--worlds"),
     "half a world": (["--worlds", "0.5"], "--worlds"),
     "unknown engine": (["--engine", "warp"], "mujoco"),

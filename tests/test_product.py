@@ -50,7 +50,7 @@ def test_training_learns_and_writes_the_run_folder(run: Path) -> None:
 @pytest.mark.slow
 def test_evaluation_measures_reports_and_gates(run: Path) -> None:
     asked = ["--require", "train.success>=0.85", "--require", "held_out.success<0.99"]
-    done = command("evaluate", str(run), "--worlds", "128", *asked)
+    done = command("evaluate", str(run), "--worlds", "128", "--against", str(run), *asked)
     assert done.returncode == 0, done.stderr
     assert "held_out" in done.stdout
     assert "train" in done.stdout
@@ -66,6 +66,7 @@ def test_evaluation_measures_reports_and_gates(run: Path) -> None:
     page = (run / "report.html").read_text()
     assert len(page) > 100_000
     assert "<script" not in page
+    assert "run (train)" in page  # the comparison, here with itself
     assert (run / "plots" / "heat_map.png").exists()
     assert (run / "plots" / "training.png").exists()
 
