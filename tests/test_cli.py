@@ -32,7 +32,18 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for layer in range(2):
         weights[f"kernel_{layer}"] = random.normal(size=sizes[layer : layer + 2]).astype(np.float32)
         weights[f"bias_{layer}"] = np.zeros(sizes[layer + 1], np.float32)
-    interface = PolicyInterface("arm_reach", 0.02, env.observations, ("a", "b"), (0, 0), (1, 1), "elu", 10.0)
+    interface = PolicyInterface(
+        environment="arm_reach",
+        control_dt=0.02,
+        observations=env.observations,
+        actions=("shoulder", "elbow"),
+        action_units=("N m", "N m"),
+        control_limits=((-40, 40), (-20, 20)),
+        control_offset=(0, 0),
+        control_scale=(40, 20),
+        activation="elu",
+        observation_clip=10.0,
+    )
     Policy(interface, weights).save(made.policy)
     return folder
 
