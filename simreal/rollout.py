@@ -1,8 +1,9 @@
 """B worlds side by side, each episode in a world of its own.
 
-A reset is expensive beside a step (a World is built, its derived constants computed), so its cost follows
-the number of episodes that end: at most `capacity` worlds are reset in one pass, and passes repeat while any
-wait.
+A reset is expensive beside a step (a World is built, its derived constants computed, the engine asked for
+what can be read), and most of it is the price of the call, not of the world. So fresh starts are made
+`RESERVE` at a time and handed out as episodes end; the next batch is made when the last is used up. The cost
+follows the number of episodes that end.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from simreal.environment import Environment, State
@@ -21,7 +23,11 @@ from simreal.world import World
 
 DrawWorld = Callable[[jax.Array, Ranges], World]
 
-_RESET, _STAGGER = 1, 2  # folded into a world's own key, so that no key serves two uses
+RESERVE = 64
+"""Fresh starts that are made together."""
+
+_STAGGER = 0x737467
+"""Folded into a world's key; small numbers would give keys that the environment's split uses."""
 
 
 @struct.dataclass
@@ -32,6 +38,9 @@ class RolloutState:
     episode_return: jax.Array  # (B,) sum of rewards so far
     started: jax.Array  # (B,) bool, False until the first reset
     counted: jax.Array  # (B,) bool, False during a staggered first episode, whose length says nothing
+    reserve: State  # fresh starts, every leaf (RESERVE, ...)
+    left: jax.Array  # () int32, how many of them are not used yet
+    key: jax.Array  # (2,) uint32, of the next fresh starts
 
 
 @struct.dataclass
@@ -50,7 +59,7 @@ class Rollout:
     Args:
         env: the environment.
         worlds: B.
-        capacity: worlds reset in one pass; None chooses from B and the episode length.
+        capacity: worlds renewed in one pass; None chooses from B and the episode length. More loop.
         stagger: whether first episodes begin at different ages, so that time limits do not come all at once.
         draw_world: (key, ranges) -> World; default: drawn from the randomizer.
     """
@@ -65,7 +74,8 @@ class Rollout:
     ) -> None:
         self.env = env
         self.worlds = worlds
-        self.capacity = min(worlds, capacity or max(4, math.ceil(2 * worlds / env.episode_steps)))
+        wanted = capacity or max(4, math.ceil(2 * worlds / env.episode_steps))
+        self.capacity = min(worlds, wanted, RESERVE)
         self.stagger = stagger
         builder = env.randomizer
         self.draw_world = draw_world or (lambda key, ranges: builder.build(builder.sample(key, ranges)))
@@ -73,35 +83,68 @@ class Rollout:
     def start(self, key: jax.Array) -> RolloutState:
         """B worlds that wait for their first reset, which the first `renew` gives them."""
         shape = jax.eval_shape(self.env.reset, key)
-        env = jax.tree.map(lambda leaf: jnp.zeros((self.worlds, *leaf.shape), leaf.dtype), shape)
-        env = dataclasses.replace(env, key=jax.random.split(key, self.worlds), done=jnp.ones_like(env.done))
-        no = jnp.zeros(self.worlds, bool)
-        return RolloutState(env, jnp.zeros_like(env.reward), started=no, counted=no)
+
+        def empty(rows: int) -> State:
+            return jax.tree.map(lambda leaf: jnp.zeros((rows, *leaf.shape), leaf.dtype), shape)
+
+        env = empty(self.worlds)
+        return RolloutState(
+            env=dataclasses.replace(env, done=jnp.ones_like(env.done)),
+            episode_return=jnp.zeros_like(env.reward),
+            started=jnp.zeros(self.worlds, bool),
+            counted=jnp.zeros(self.worlds, bool),
+            reserve=empty(RESERVE),
+            left=jnp.zeros((), jnp.int32),
+            key=key,
+        )
 
     def renew(self, state: RolloutState, ranges: Ranges) -> RolloutState:
-        """Resets every world whose episode is over into a fresh World and a fresh start state."""
+        """Gives every world whose episode is over a fresh World and a fresh start state."""
 
-        def waiting(carry: tuple[RolloutState, jax.Array]) -> jax.Array:
-            return jnp.any(carry[1])
+        def waiting(state: RolloutState) -> jax.Array:
+            return jnp.any(state.env.done > 0)
 
-        def one_pass(carry: tuple[RolloutState, jax.Array]) -> tuple[RolloutState, jax.Array]:
-            state, done = carry
-            (rows,) = jnp.nonzero(done, size=self.capacity, fill_value=self.worlds)
-            fresh = jax.vmap(self._fresh, in_axes=(0, 0, None))(
-                state.env.key[rows], state.started[rows], ranges
-            )
-            state = jax.tree.map(lambda old, new: old.at[rows].set(new, mode="drop"), state, fresh)
-            return state, done.at[rows].set(False, mode="drop")
+        def one_pass(state: RolloutState) -> RolloutState:
+            state = jax.lax.cond(state.left == 0, lambda s: self._fill(s, ranges), lambda s: s, state)
+            return self._hand_out(state)
 
-        return jax.lax.while_loop(waiting, one_pass, (state, state.env.done > 0))[0]
+        return jax.lax.while_loop(waiting, one_pass, state)
 
-    def _fresh(self, key: jax.Array, started: jax.Array, ranges: Ranges) -> RolloutState:
-        world_key, start_key = jax.random.split(jax.random.fold_in(key, _RESET))
-        env = self.env.reset(start_key, world=self.draw_world(world_key, ranges))
-        counted = started | (not self.stagger)
-        age = jax.random.randint(jax.random.fold_in(key, _STAGGER), (), 0, self.env.episode_steps)
+    def _fill(self, state: RolloutState, ranges: Ranges) -> RolloutState:
+        """Makes RESERVE fresh starts."""
+
+        def fresh(key: jax.Array) -> State:
+            world_key, start_key = jax.random.split(key)
+            return self.env.reset(start_key, world=self.draw_world(world_key, ranges))
+
+        key, fill_key = jax.random.split(state.key)
+        reserve = jax.vmap(fresh)(jax.random.split(fill_key, RESERVE))
+        return dataclasses.replace(state, reserve=reserve, left=jnp.asarray(RESERVE, jnp.int32), key=key)
+
+    def _hand_out(self, state: RolloutState) -> RolloutState:
+        """Starts the first worlds that wait, `capacity` of them or as many as are in reserve."""
+        order = np.arange(self.capacity)
+        (rows,) = jnp.nonzero(state.env.done > 0, size=self.capacity, fill_value=self.worlds)
+        rows = jnp.where(order < state.left, rows, self.worlds)  # out of bounds: dropped
+        slots = jnp.maximum(state.left - 1 - order, 0)
+        env = jax.tree.map(lambda leaf: leaf[slots], state.reserve)
+
+        counted = state.started[rows] | (not self.stagger)
+        age_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(env.key, _STAGGER)
+        age = jax.vmap(lambda key: jax.random.randint(key, (), 0, self.env.episode_steps))(age_keys)
         env = dataclasses.replace(env, steps=jnp.where(counted, env.steps, age))
-        return RolloutState(env, jnp.zeros_like(env.reward), started=jnp.ones((), bool), counted=counted)
+
+        def put(old: jax.Array, new: jax.Array | float | bool) -> jax.Array:
+            return old.at[rows].set(new, mode="drop")
+
+        return dataclasses.replace(
+            state,
+            env=jax.tree.map(put, state.env, env),
+            episode_return=put(state.episode_return, 0.0),
+            started=put(state.started, True),
+            counted=put(state.counted, counted),
+            left=state.left - jnp.sum(rows < self.worlds, dtype=jnp.int32),
+        )
 
     def step(self, state: RolloutState, action: jax.Array) -> tuple[RolloutState, Ended]:
         """One control step of all worlds; `renew` first. `state.env.obs` is then the final observation of

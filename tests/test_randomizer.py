@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -57,9 +59,8 @@ def episode_starts(name, worlds=256, at_least=2_000):
         state = renew(state, env.randomizer.ranges)
         draws.append(jax.tree.map(np.asarray, state.env.world.draws))
         simultaneous.append(np.asarray(state.env.world.number))
-        # All episodes end: the next renewal draws them all anew, from the keys that their worlds carry.
-        key = jax.vmap(lambda k: jax.random.split(k)[0])(state.env.key)
-        state = state.replace(env=state.env.replace(done=jnp.ones(worlds), key=key))
+        # All episodes end: the next renewal draws them all anew.
+        state = dataclasses.replace(state, env=dataclasses.replace(state.env, done=jnp.ones(worlds)))
     joined = {n: np.concatenate([d[n] for d in draws]) for n in draws[0]}
     return env, joined, simultaneous, before == model_bytes(env.mj_model)
 
