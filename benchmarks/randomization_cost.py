@@ -1,9 +1,9 @@
 """What fresh worlds cost: steps/s where everything varies, against nominal worlds and a cached reset.
 
 Both sides have the same actuators and sensors. Actions are small noise about zero, so that episodes end by
-their time limit, staggered over the worlds. A factor that adds work to the physics itself shows here too: dry friction in
-the Go2's joints, zero in the nominal model, gives the solver twelve more constraints. The line "without" leaves it
-out on both sides.
+their time limit, staggered over the worlds. A factor that adds work to the physics itself shows here too: dry
+friction in the Go2's joints, zero in the nominal model, gives the solver twelve more constraints. The line
+"without" leaves it out on both sides.
 
 Run it with `python benchmarks/randomization_cost.py [environment:engine[:factor left out] ...]`.
 """
@@ -88,9 +88,10 @@ def compare(name: str, engine: str, without: str = "", pairs: int = 15) -> float
     times = interleaved(fresh_call, nominal_call, pairs)
     speeds = WORLDS * steps / times
     ratio = float(np.median(speeds[:, 0] / speeds[:, 1]))
+    fast, slow = np.median(speeds, axis=0)
+    what = f"{name} {engine}" + (f" without {without}" if without else "")
     print(
-        f"{name:18s} {engine:7s} {'without ' + without if without else '':22s} fresh {np.median(speeds[:, 0]):9,.0f} steps/s   nominal, cached "
-        f"{np.median(speeds[:, 1]):9,.0f} steps/s   ratio {ratio:.3f}",
+        f"{what:46s} fresh {fast:9,.0f} steps/s   nominal, cached {slow:9,.0f} steps/s   ratio {ratio:.3f}",
         flush=True,
     )
     return ratio
