@@ -419,11 +419,6 @@ class Environment(abc.ABC):
         clean = self._observe(true_reading, task, action)
         return jnp.concatenate([clean, self.privileged(data, task), world.normalized])
 
-    def replace(self, **options: Any) -> Environment:
-        """The same task on another engine or randomizer."""
-        current: dict[str, Any] = {"engine": self.engine_name, "randomizer": self.randomizer.randomizer}
-        return type(self)(**(current | options))
-
 
 def _effects(
     randomizer: Randomizer, group: str, effects: Mapping[str, Mapping[str, float]]

@@ -59,7 +59,8 @@ class Rollout:
     Args:
         env: the environment.
         worlds: B.
-        capacity: worlds renewed in one pass; None chooses from B and the episode length. More loop.
+        capacity: worlds renewed in one pass; None chooses from B and the episode length. Passes repeat
+            while any world waits.
         stagger: whether first episodes begin at different ages, so that time limits do not come all at once.
         draw_world: (key, ranges) -> World; default: drawn from the randomizer.
     """
