@@ -27,8 +27,13 @@ ENVIRONMENTS = ("arm_reach", "cartpole_swingup", "go2_walk")
 @functools.cache
 def environment(name: str, engine: str = "mujoco") -> Environment:
     """An environment with its training ranges; skips the test where its model cannot be had."""
+    return make(name, engine=engine)
+
+
+def make(name: str, **arguments) -> Environment:
+    """`simreal.make`, but the test is skipped where the environment's model cannot be had."""
     try:
-        return simreal.make(name, engine=engine)
+        return simreal.make(name, **arguments)
     except simreal.UserError as error:
         if "cannot be had" in str(error):
             pytest.skip(str(error))

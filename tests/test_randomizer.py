@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from conftest import ENVIRONMENTS, environment, keys
+from conftest import ENVIRONMENTS, environment, keys, make
 from scipy import stats
 
 import simreal
@@ -126,7 +126,7 @@ def test_building_twice_is_the_same_world_and_draws_do_not_compound():
 
 
 def world_of(factor, value, name="go2_walk"):
-    env = environment(name).replace(randomizer=simreal.Randomizer(factor=factor))
+    env = make(name, randomizer=simreal.Randomizer(factor=factor))
     return env, env.randomizer.build({"factor": value})
 
 
@@ -210,7 +210,7 @@ def test_units_are_those_of_what_is_addressed():
         "play": actuator.backlash("*").set(Uniform(0, 0.1)),
         "far": sensor.drift("gyro").set(Uniform(0, 1)),
     }
-    bound = environment("go2_walk").replace(randomizer=simreal.Randomizer(**factors)).randomizer.bound
+    bound = make("go2_walk", randomizer=simreal.Randomizer(**factors)).randomizer.bound
     assert (bound["play"].unit, bound["far"].unit) == ("rad", "rad/s/sqrt(s)")
     assert environment("arm_reach").randomizer.bound["motor_noise"].unit == "N m"
 
@@ -243,8 +243,8 @@ BAD = {
         "no position actuator",
     ),
     "deadband of a servo": (
-        lambda: environment("go2_walk").replace(
-            randomizer=simreal.Randomizer(f=actuator.deadband("*").set(Uniform(0, 0.1)))
+        lambda: make(
+            "go2_walk", randomizer=simreal.Randomizer(f=actuator.deadband("*").set(Uniform(0, 0.1)))
         ),
         "is a position actuator",
     ),
