@@ -23,8 +23,10 @@ from simreal.randomizers import actuator, physics, sensor
 DT = 0.002
 STEPS = 250
 WORLDS = 64
-CARTS = ["plain", "delayed", "lagged", "dead", "saturated", "noisy", "wandering", "weak", "fast", "hot", "played", "loaded"]
-READINGS = ["exact", "delayed", "biased", "scaled", "noisy", "drifting", "sampled", "rounded", "lossy", "bursty"]
+CARTS = ("plain", "delayed", "lagged", "dead", "saturated", "noisy", "wandering", "weak")
+CARTS += ("fast", "hot", "played", "loaded")
+READINGS = ("exact", "delayed", "biased", "scaled", "noisy", "drifting", "sampled")
+READINGS += ("rounded", "lossy", "bursty")
 TIME = DT * np.arange(1, STEPS + 1)
 """True position of the rolling cart at each reading after the first."""
 
@@ -82,7 +84,8 @@ VALUES = {
 
 
 def cart(name):
-    return f'<body name="{name}"><joint name="{name}" type="slide" axis="1 0 0"/><geom size=".1" mass="1"/></body>'
+    joint = f'<joint name="{name}" type="slide" axis="1 0 0"/>'
+    return f'<body name="{name}">{joint}<geom size=".1" mass="1"/></body>'
 
 
 def motor(name):
