@@ -123,7 +123,10 @@ class Bound:
 
         def apply(values: jax.Array) -> jax.Array:
             spread = draw.astype(values.dtype)[position] if draw.ndim else draw.astype(values.dtype)
-            return jnp.where(self.mask & ~jnp.isnan(spread), operation(values, spread), values)
+            changed = operation(values, spread)
+            # A draw that is NaN leaves the nominal value. Asked of the result: asked of the draw, the compiler
+            # of JAX 0.9.2 dies of a division by zero (SIGFPE).
+            return jnp.where(self.mask & ~jnp.isnan(changed), changed, values)
 
         return apply
 
