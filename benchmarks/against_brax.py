@@ -104,30 +104,34 @@ def make_environment(config):
     return registry.make(config.environment, engine=config.engine, randomizer=training)
 
 
-def evaluation_keys(seed: int):
-    """The keys that Brax's `train` evaluates with, one after the other."""
+def evaluation_key(seed: int):
+    """The key that Brax's `train` splits off a key for each evaluation from."""
     import jax
 
-    _, local = jax.random.split(jax.random.PRNGKey(seed))
-    _, _, key = jax.random.split(jax.random.fold_in(local, 0), 3)
-    while True:
-        key, now = jax.random.split(key)
-        yield now
+    @jax.jit
+    def derive(key):
+        _, local = jax.random.split(key)
+        return jax.random.split(jax.random.fold_in(local, 0), 3)[2]
+
+    return derive(jax.random.PRNGKey(seed))
 
 
-def episodes(learner, worlds: int = EVALUATION_WORLDS):
-    """A jitted (policy, normalizer, key) -> returns (worlds,), success (worlds,) of the mean action.
+def evaluation(learner, worlds: int = EVALUATION_WORLDS):
+    """Programs key -> (key, starts), and (policy, normalizer, starts) -> returns (worlds,), success (worlds,).
 
-    As much work as Brax's `Evaluator` does: all worlds are stepped to the time limit.
+    Of the mean action, in the worlds that Brax's `Evaluator` draws from the same key, as much work as its:
+    all worlds are stepped to the time limit.
     """
     import jax
     import jax.numpy as jnp
 
     env, networks = learner.env, learner.networks
 
-    @jax.jit
-    def run(policy, normalizer, key):
-        state = jax.vmap(env.reset)(jax.random.split(key, worlds))
+    def begin(key):
+        key, now = jax.random.split(key)
+        return key, jax.vmap(env.reset)(jax.random.split(now, worlds))
+
+    def run(policy, normalizer, state):
         zero = jnp.zeros_like(state.reward)
 
         def step(carry, _):
@@ -143,13 +147,14 @@ def episodes(learner, worlds: int = EVALUATION_WORLDS):
         _, total, success, _ = jax.lax.scan(step, carry, length=env.episode_steps)[0]
         return total, success
 
-    return run
+    return begin, run
 
 
 def run_simreal(plan: Plan, seed: int, record: Record) -> None:
     """simreal's learner."""
     import jax
 
+    from simreal.compilation import SideBySide, for_rare_use
     from simreal.learner import Learner
 
     config = plan.config(seed)
@@ -157,16 +162,21 @@ def run_simreal(plan: Plan, seed: int, record: Record) -> None:
     env = make_environment(config)
     record.mark("environment")
     learner = Learner(env, config)
-    state = jax.block_until_ready(learner.init(seed))
-    run, keys = episodes(learner), evaluation_keys(seed)
+    shape, (begin, run) = learner.state_shape, evaluation(learner)
+    with SideBySide() as compile_:
+        started, (_, starts) = compile_(begin, shape.key, compiler_options=for_rare_use())
+        ran, _ = compile_(run, shape.params.policy, shape.normalizer, starts)
+        state = jax.block_until_ready(learner.init(seed))
+    begin, run, key = started.result(), ran.result(), evaluation_key(seed)
     record.mark("set-up")
     for done in range(plan.evaluations + 1):
-        begin = time.monotonic()
+        before = time.monotonic()
         if done:
             state, _ = jax.block_until_ready(learner.epoch(state))
         trained = time.monotonic()
-        total, success = jax.block_until_ready(run(state.params.policy, state.normalizer, next(keys)))
-        seconds = {"train": trained - begin, "evaluate": time.monotonic() - trained}
+        key, starts = begin(key)
+        total, success = jax.device_get(run(state.params.policy, state.normalizer, starts))
+        seconds = {"train": trained - before, "evaluate": time.monotonic() - trained}
         record.evaluated(int(state.steps), total.mean(), success.mean(), **seconds)
 
 
@@ -443,7 +453,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--engine", choices=("mujoco", "mjx"), default="mujoco")
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--evaluations", type=int, default=30, help="after the one before training")
+    parser.add_argument("--evaluations", type=int, default=12, help="after the one before training")
     parser.add_argument("--iterations", type=int, default=20, help="updates between two evaluations")
     parser.add_argument("--out", type=Path, default=Path("runs/against_brax"))
     for internal, kind in (("--side", str), ("--seed", int), ("--began", float)):

@@ -20,7 +20,7 @@ from timing import interleaved, machine
 
 import simreal
 from simreal.registry import environment_class
-from simreal.rollout import Rollout, RolloutState
+from simreal.rollout import Reserve, Rollout, RolloutState
 
 WORLDS = 512
 DEFAULT = (
@@ -35,7 +35,10 @@ DEFAULT = (
 class CachedRollout(Rollout):
     """Every world starts again from its first state: what a rollout without randomisation may do."""
 
-    def renew(self, state: RolloutState, ranges) -> RolloutState:
+    def refill(self, reserve: Reserve, ranges) -> Reserve:
+        return reserve
+
+    def renew(self, state: RolloutState) -> RolloutState:
         done = state.env.done > 0
 
         def choose(now, first):
@@ -53,8 +56,10 @@ def caller(rollout: Rollout, steps: int):
 
     @jax.jit
     def run(state, key):
+        state = dataclasses.replace(state, reserve=rollout.refill(state.reserve, ranges))
+
         def one(state, key):
-            state = rollout.renew(state, ranges)
+            state = rollout.renew(state)
             action = 0.05 * jax.random.normal(key, (rollout.worlds, rollout.env.action_size))
             state, _ = rollout.step(state, action)
             return state, None
@@ -81,8 +86,13 @@ def compare(name: str, engine: str, without: str = "", pairs: int = 15) -> float
     fresh_holder, fresh_call = caller(fresh, steps)
     fresh_holder["state"] = fresh.start(jax.random.PRNGKey(0))
     nominal_holder, nominal_call = caller(nominal, steps)
-    renew = jax.jit(lambda state: Rollout.renew(nominal, state, env.randomizer.ranges))
-    started = renew(nominal.start(jax.random.PRNGKey(0)))
+
+    @jax.jit
+    def begin(state):
+        reserve = Rollout.refill(nominal, state.reserve, env.randomizer.ranges)
+        return Rollout.renew(nominal, dataclasses.replace(state, reserve=reserve))
+
+    started = begin(nominal.start(jax.random.PRNGKey(0)))
     nominal.first = started.replace(env=started.env.replace(steps=jnp.zeros_like(started.env.steps)))
     nominal_holder["state"] = started
     times = interleaved(fresh_call, nominal_call, pairs)

@@ -1,4 +1,4 @@
-"""JAX's persistent compilation cache, in the user's cache folder."""
+"""JAX's persistent compilation cache, in the user's cache folder; and compiling several programs at once."""
 
 from __future__ import annotations
 
@@ -6,7 +6,11 @@ import hashlib
 import os
 import platform
 import sys
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from types import TracebackType
+from typing import Any
 
 SWITCH = "SIMREAL_CACHE"
 """Environment variable: `off` compiles anew every time, a path puts the cache there."""
@@ -45,6 +49,56 @@ def enable_cache() -> Path | None:
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_SECONDS)
     return folder
+
+
+def for_rare_use() -> dict[str, Any]:
+    """`compiler_options` for a program that runs too rarely to be worth optimising: half the compile time."""
+    import jax
+
+    return {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else {}
+
+
+class SideBySide:
+    """Compiles programs in threads while others are traced; leaving the block waits for all.
+
+    Most of XLA's work on one program is serial, and it lets go of Python's lock. Tracing needs the lock and
+    the caller's settings of JAX, so it happens in the caller's thread.
+
+        with SideBySide() as compile_:
+            program, result = compile_(function, *shapes)
+            other, _ = compile_(another, result)
+        program.result()(...)
+    """
+
+    def __init__(self) -> None:
+        # XLA itself uses a second core for part of its work.
+        from simreal.runs import cpu_affinity
+
+        self._pool = ThreadPoolExecutor(max(1, len(cpu_affinity()) // 2), thread_name_prefix="compile")
+
+    def __enter__(self) -> SideBySide:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._pool.shutdown(cancel_futures=error is not None)
+
+    def __call__(
+        self, function: Callable[..., Any], *arguments: Any, **options: Any
+    ) -> tuple[Future[Any], Any]:
+        """The program, when it is ready, and the shapes of its result.
+
+        Args:
+            function: what to compile.
+            arguments: its arguments, or their shapes.
+            options: as of `jax.jit`.
+        """
+        import jax
+
+        traced = jax.jit(function, **options).trace(*arguments)
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), traced.out_info)
+        return self._pool.submit(traced.lower().compile), shapes
 
 
 def cache_size(folder: Path) -> int:

@@ -107,6 +107,9 @@ class RolloutConfig:
 
     reset_capacity: PositiveInt | None = None
     """Worlds reset in one pass, more in a loop; null derives it from `worlds` and the episode length."""
+    reserve: PositiveInt | None = None
+    """Fresh starts kept ready for worlds whose episode ends; null keeps one for each. Raise it where many
+    episodes are shorter than an unroll: without one, a world waits for the next update."""
     stagger: bool = True
     """Whether the first episodes start at different ages, so that ends do not come all at once."""
     greedy_worlds: NonNegativeInt = 32

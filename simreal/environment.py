@@ -174,6 +174,9 @@ class Environment(abc.ABC):
             limits_force=bool(self.actuators.effects & {"no_load_speed", "thermal_limit"}),
         )
         self.engine_name = resolve(engine)
+        # Inlined where a larger program calls them; what this saves is to trace them anew for each program.
+        self._traced_reset = jax.jit(self._reset, inline=True)
+        self._traced_step = jax.jit(self._step, inline=True)
 
     def _make_actuators(self, randomizer: Randomizer) -> Actuators:
         limited = self.mj_model.actuator_ctrllimited.astype(bool)[:, None]
@@ -290,6 +293,15 @@ class Environment(abc.ABC):
             world: this World instead of a drawn one.
             ranges: draw from these instead of the randomizer's (`env.randomizer.ranges` moved).
         """
+        return self._traced_reset(key, world, ranges)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """One control step. An action is clipped to [-1, 1]; a state that is done steps on regardless."""
+        return self._traced_step(state, action)
+
+    # -- inside --------------------------------------------------------------------------------------------
+
+    def _reset(self, key: jax.Array, world: World | None, ranges: Ranges | None) -> State:
         key, world_key, start_key, actuator_key, sensor_key = jax.random.split(key, 5)
         if world is None:
             world = self.randomizer.build(self.randomizer.sample(world_key, ranges))
@@ -319,8 +331,7 @@ class Environment(abc.ABC):
             steps=jnp.zeros((), jnp.int32),
         )
 
-    def step(self, state: State, action: jax.Array) -> State:
-        """One control step. An action is clipped to [-1, 1]; a state that is done steps on regardless."""
+    def _step(self, state: State, action: jax.Array) -> State:
         key, actuator_key, period_key, push_key, sensor_key = jax.random.split(state.key, 5)
         action = jnp.clip(action.astype(state.action.dtype), -1, 1)
         now = state.world.at(state.physics.time)
@@ -377,8 +388,6 @@ class Environment(abc.ABC):
             key=key,
             steps=steps,
         )
-
-    # -- inside --------------------------------------------------------------------------------------------
 
     def _force_limit(self, world: World) -> jax.Array:
         """(nu,) largest force of each actuator; infinite where nothing limits it."""

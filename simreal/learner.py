@@ -1,29 +1,33 @@
 """PPO from Brax's parts: its networks, loss, advantage estimate, normaliser and action distribution.
 
-The loop is ours. One iteration is two programs: `collect` steps the worlds (and alone contains calls to the
-host, which JAX never caches on disk), `update` learns from what they did. Everything that a run is lies in
-one pytree.
+The loop is ours. One iteration is three programs: `refill` makes fresh starts, `collect` steps the worlds,
+`update` learns from what they did. The first two contain calls to the host where the engine does, and are
+then never cached on disk by JAX. Everything that a run is lies in one pytree.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
+from jax.flatten_util import ravel_pytree
 
 from simreal.brax_parts import losses, optimizer, running_statistics, specs, types
+from simreal.compilation import SideBySide, for_rare_use
 from simreal.config import RunConfig
 from simreal.environment import Environment
 from simreal.networks import make_networks
 from simreal.policy import Policy
 from simreal.randomizer import Ranges
-from simreal.rollout import Ended, Rollout, RolloutState
+from simreal.rollout import Ended, Reserve, Rollout, RolloutState
 
 Metrics = dict[str, jax.Array]
 
@@ -47,6 +51,13 @@ class TrainingState:
     steps: jax.Array  # () uint32, environment steps learnt from
 
 
+class _Programs(NamedTuple):
+    start: Callable[[np.uint32], TrainingState]
+    refill: Callable[[Reserve, Ranges], Reserve]
+    collect: Callable[..., tuple[RolloutState, types.Transition, Ended]]
+    update: Callable[..., tuple[TrainingState, Metrics]]
+
+
 class Learner:
     """Trains one policy on one environment.
 
@@ -66,6 +77,7 @@ class Learner:
             env,
             config.worlds + config.rollout.greedy_worlds,
             config.rollout.reset_capacity,
+            config.rollout.reserve,
             config.rollout.stagger,
             nominal,
         )
@@ -88,19 +100,44 @@ class Learner:
             clipping_epsilon_value=hyper.clip_value,
             vf_coefficient=hyper.value_cost,
         )
-        self._init = jax.jit(self._start)
-        self._collect = jax.jit(self.collect, donate_argnums=0)
-        self._update = jax.jit(self.update, donate_argnums=0)
-        self._summarise = jax.jit(_summarise)
 
     @property
     def steps_per_epoch(self) -> int:
         """Environment steps that one epoch learns from."""
         return self.worlds * self.config.learner.unroll_length * self.config.learner.iterations_per_epoch
 
+    @functools.cached_property
+    def state_shape(self) -> TrainingState:
+        """Shapes and types of everything that a run is."""
+        return jax.eval_shape(self._start, jax.ShapeDtypeStruct((), jnp.uint32))
+
+    @functools.cached_property
+    def _programs(self) -> _Programs:
+        """Compiled at first use, side by side: it takes about as long as the longest of them."""
+        state = self.state_shape
+        assert isinstance(state.rollout, RolloutState)
+        with SideBySide() as compile_:
+            collect, (_, data, ended) = compile_(
+                self.collect,
+                *(state.rollout, state.params.policy, state.normalizer, state.key),
+                donate_argnums=0,
+            )
+            update, _ = compile_(
+                self.update, dataclasses.replace(state, rollout=()), data, ended, donate_argnums=0
+            )
+            refill, _ = compile_(
+                self.rollout.refill,
+                *(state.rollout.reserve, state.ranges),
+                donate_argnums=0,
+                compiler_options=for_rare_use(),
+            )
+            seed = jax.ShapeDtypeStruct((), jnp.uint32)
+            start, _ = compile_(self._start, seed, compiler_options=for_rare_use())
+        return _Programs(start.result(), refill.result(), collect.result(), update.result())
+
     def init(self, seed: int) -> TrainingState:
         """The run before its first step."""
-        return self._init(np.uint32(seed))
+        return self._programs.start(np.uint32(seed))
 
     def _start(self, seed: jax.Array) -> TrainingState:
         key, policy_key, value_key, world_key = jax.random.split(jax.random.PRNGKey(seed), 4)
@@ -111,7 +148,7 @@ class Learner:
         sizes = jax.tree.map(lambda o: specs.Array(o.shape, o.dtype), self._observations)
         state = TrainingState(
             params=params,
-            optimizer=self.optimizer.init(params),
+            optimizer=self.optimizer.init(ravel_pytree(params)[0]),
             normalizer=running_statistics.init_state(sizes),
             rollout=self.rollout.start(world_key),
             ranges=self.env.randomizer.ranges,
@@ -122,22 +159,24 @@ class Learner:
         # The explicit type takes away weak types, for which the first epoch would compile a second program.
         return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x)), state)
 
-    def epoch(self, state: TrainingState) -> tuple[TrainingState, Metrics]:
+    def epoch(self, state: TrainingState) -> tuple[TrainingState, dict[str, float]]:
         """`iterations_per_epoch` times collect and update. The state passed in is used up."""
-        rows = []
+        programs, rows = self._programs, []
         for _ in range(self.config.learner.iterations_per_epoch):
-            rollout, data, ended = self._collect(
-                state.rollout, state.params.policy, state.normalizer, state.ranges, state.key
-            )
-            learnt, row = self._update(dataclasses.replace(state, rollout=()), data, ended)
+            rollout = state.rollout
+            assert isinstance(rollout, RolloutState)  # () only inside `update`
+            reserve = programs.refill(rollout.reserve, state.ranges)
+            rollout = dataclasses.replace(rollout, reserve=reserve)
+            rollout, data, ended = programs.collect(rollout, state.params.policy, state.normalizer, state.key)
+            learnt, row = programs.update(dataclasses.replace(state, rollout=()), data, ended)
             state = dataclasses.replace(learnt, rollout=rollout)
             rows.append(row)
-        return state, self._summarise(rows, state.last_success)
+        return state, _summarise(*jax.device_get((rows, state.last_success)))
 
     # -- collect -------------------------------------------------------------------------------------------
 
     def collect(
-        self, rollout: RolloutState, policy: Any, normalizer: Any, ranges: Ranges, key: jax.Array
+        self, rollout: RolloutState, policy: Any, normalizer: Any, key: jax.Array
     ) -> tuple[RolloutState, types.Transition, Ended]:
         """`unroll_length` control steps of all worlds; the learning worlds' data has leaves (T, B, ...)."""
         distribution = self.networks.parametric_action_distribution
@@ -146,7 +185,7 @@ class Learner:
         def one_step(
             state: RolloutState, key: jax.Array
         ) -> tuple[RolloutState, tuple[types.Transition, Ended]]:
-            state = self.rollout.renew(state, ranges)
+            state = self.rollout.renew(state)
             seen = {"state": state.env.obs, "privileged_state": state.env.privileged}
             logits = self.networks.policy_network.apply(normalizer, policy, seen)
             raw = distribution.sample_no_postprocessing(logits, key)
@@ -185,9 +224,11 @@ class Learner:
         self, state: TrainingState, data: types.Transition, ended: Ended
     ) -> tuple[TrainingState, Metrics]:
         """`epochs` passes of minibatch gradient steps over the data; `state` comes without its rollout."""
-        params, normalizer = state.params, state.normalizer
+        normalizer = state.normalizer
+        # One flat array of all parameters compiles and steps faster than one for each layer.
+        weights, as_params = ravel_pytree(state.params)
         hyper = self.config.learner
-        old_values = self.networks.value_network.apply(normalizer, params.value, data.observation)
+        old_values = self.networks.value_network.apply(normalizer, state.params.value, data.observation)
         data.extras["policy_extras"]["value"] = old_values
         observation = data.observation
         # To (B, T, ...): a minibatch is some worlds over the whole unroll, for the advantage estimate.
@@ -196,10 +237,13 @@ class Learner:
         def gradient_step(
             carry: tuple[Any, Any], batch: tuple[types.Transition, jax.Array]
         ) -> tuple[tuple[Any, Any], Metrics]:
-            params, optimizer_state = carry
+            weights, optimizer_state = carry
             minibatch, key = batch
-            gradient_of = jax.value_and_grad(self.loss, has_aux=True)
-            (_, metrics), gradient = gradient_of(params, normalizer, minibatch, key)
+
+            def loss(weights: jax.Array) -> tuple[jax.Array, Metrics]:
+                return self.loss(as_params(weights), normalizer, minibatch, key)
+
+            (_, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(weights)
             rate = jnp.asarray(hyper.learning_rate)
             if hyper.adaptive_kl is not None:
                 optimizer_state, rate = optimizer.adaptive_kl_learning_rate(
@@ -210,13 +254,13 @@ class Learner:
                     hyper.max_learning_rate,
                 )
             change, new_optimizer_state = self.optimizer.update(gradient, optimizer_state)
-            new_params = optax.apply_updates(params, change)
+            new_weights = weights + change
             # A gradient that is not finite is skipped and counted: it would be in the parameters for ever.
-            fine = jnp.isfinite(optax.tree.norm(gradient))
+            fine = jnp.all(jnp.isfinite(gradient))
             kept = jax.tree.map(
                 lambda new, old: jnp.where(fine, new, old),
-                (new_params, new_optimizer_state),
-                (params, optimizer_state),
+                (new_weights, new_optimizer_state),
+                (weights, optimizer_state),
             )
             return kept, {**metrics, "learning_rate": rate, "skipped_updates": 1.0 - fine}
 
@@ -231,10 +275,10 @@ class Learner:
             return jax.lax.scan(gradient_step, carry, (jax.tree.map(split, data), keys))
 
         pass_keys = jax.random.split(jax.random.fold_in(state.key, _UPDATE), hyper.epochs)
-        (params, optimizer_state), metrics = jax.lax.scan(one_pass, (params, state.optimizer), pass_keys)
+        (weights, optimizer_state), metrics = jax.lax.scan(one_pass, (weights, state.optimizer), pass_keys)
         learnt = dataclasses.replace(
             state,
-            params=params,
+            params=as_params(weights),
             optimizer=optimizer_state,
             # After the passes: the old distribution parameters stay comparable for the divergence.
             normalizer=running_statistics.update(normalizer, observation, std_min_value=_SD_FLOOR),
@@ -261,19 +305,19 @@ _REPORTED = {
 """Name in metrics.jsonl -> name in Brax's loss."""
 
 
-def _summarise(rows: list[Metrics], last_success: jax.Array) -> Metrics:
-    """One row for an epoch: means over its updates, sums and rates over its episodes."""
-    total = {name: jnp.sum(jnp.stack([row[name] for row in rows])) for name in rows[0]}
+def _summarise(rows: list[dict[str, np.ndarray]], last_success: np.ndarray) -> dict[str, float]:
+    """One row for an epoch: means over its updates, sums and rates over its episodes; NaN where none."""
+    total = {name: float(np.sum([row[name] for row in rows])) for name in rows[0]}
     episodes = total.pop("episodes")
     returns, successes = total.pop("returns"), total.pop("successes")
-    means = {name: total[name] / len(rows) for name in _REPORTED}
+    known = last_success[~np.isnan(last_success)]
     return (
         total
-        | means
+        | {name: total[name] / len(rows) for name in _REPORTED}
         | {
-            "episode_return": returns / episodes,
-            "success_rate": jnp.nanmean(last_success),
-            "exploring_success_rate": successes / episodes,
+            "episode_return": returns / episodes if episodes else math.nan,
+            "success_rate": float(known.mean()) if known.size else math.nan,
+            "exploring_success_rate": successes / episodes if episodes else math.nan,
             "episodes": episodes,
         }
     )
@@ -287,6 +331,7 @@ def _count_episodes(ended: Ended, learning: int) -> Metrics:
         "returns": jnp.sum(jnp.where(done, ended.episode_return[:, :learning], 0)),
         "successes": jnp.sum(jnp.where(done, ended.success[:, :learning], 0)),
         "diverged": jnp.sum(ended.diverged),
+        "idle_steps": jnp.sum(ended.idle, dtype=float),
     }
 
 

@@ -124,8 +124,8 @@ class Bound:
         def apply(values: jax.Array) -> jax.Array:
             spread = draw.astype(values.dtype)[position] if draw.ndim else draw.astype(values.dtype)
             changed = operation(values, spread)
-            # A draw that is NaN leaves the nominal value. Asked of the result: asked of the draw, the compiler
-            # of JAX 0.9.2 dies of a division by zero (SIGFPE).
+            # A draw that is NaN leaves the nominal value. This asks the result: asking the draw makes the
+            # compiler of JAX 0.9.2 die of a division by zero (SIGFPE).
             return jnp.where(self.mask & ~jnp.isnan(changed), changed, values)
 
         return apply
@@ -255,23 +255,29 @@ class WorldBuilder:
         times = jnp.stack([full[f"{n}_time"] for n in self.events]) if self.events else jnp.zeros(0)
         order = jnp.argsort(jnp.argsort(times))
         if self.events:
-            varying = jax.vmap(lambda stage: self._stage(full, stage > order))(jnp.arange(len(times) + 1))
+            stages = jnp.arange(len(times) + 1)
+            fields, parameters = jax.vmap(lambda stage: self._stage(full, stage > order))(stages)
+            packed = jax.vmap(world_module.pack)(fields)
+            number = jax.vmap(world_module.digest)(packed)
         else:
-            varying = self._stage(full, order)
-        model, parameters, number = varying
+            fields, parameters = self._stage(full, order)
+            packed = world_module.pack(fields)
+            number = world_module.digest(packed)
+        axes = number.ndim - 1
         return World(
-            model=model,
+            packed=packed,
             **parameters,
             draws=full,
             normalized=self.normalize(full),
             number=number,
             event_times=jnp.sort(times),
             variant=jnp.zeros((), jnp.int32),
+            layout=tuple((name, fields[name].shape[axes:]) for name in sorted(fields)),
         )
 
     def _stage(
         self, draws: Draws, happened: jax.Array
-    ) -> tuple[dict[str, jax.Array], dict[str, dict[str, jax.Array]], jax.Array]:
+    ) -> tuple[dict[str, jax.Array], dict[str, dict[str, jax.Array]]]:
         """Fields and parameters with the events `happened` (events,) applied."""
         fields = {name: jnp.asarray(value, dtype=float) for name, value in self._nominal.items()}
         parameters: dict[str, dict[str, jax.Array]] = {
@@ -294,7 +300,7 @@ class WorldBuilder:
             # Cameras and lights are only for pictures, which are drawn from a model that C has finished.
             derived = {k: v for k, v in self._derive(fields).items() if not k.startswith(("cam_", "light_"))}
             fields |= {k: v.astype(jnp.result_type(float)) for k, v in derived.items()}
-        return fields, parameters, world_module.digest(fields)
+        return fields, parameters
 
     # -- checks --------------------------------------------------------------------------------------------
 

@@ -1,9 +1,9 @@
 """B worlds side by side, each episode in a world of its own.
 
 A reset is expensive beside a step (a World is built, its derived constants computed, the engine asked for
-what can be read), and most of it is the price of the call, not of the world. So fresh starts are made
-`RESERVE` at a time and handed out as episodes end; the next batch is made when the last is used up. The cost
-follows the number of episodes that end.
+what can be read), and most of it is the price of the call, not of the world. So fresh starts are kept in a
+reserve: `refill` makes them, `BATCH` at a time, between unrolls; `renew` hands them out as episodes end. The
+cost follows the number of episodes that end, and the program that steps the worlds contains no reset.
 """
 
 from __future__ import annotations
@@ -23,11 +23,21 @@ from simreal.world import World
 
 DrawWorld = Callable[[jax.Array, Ranges], World]
 
-RESERVE = 64
+BATCH = 64
 """Fresh starts that are made together."""
 
 _STAGGER = 0x737467
 """Folded into a world's key; small numbers would give keys that the environment's split uses."""
+
+
+@struct.dataclass
+class Reserve:
+    """Fresh starts in a ring: the oldest is used first."""
+
+    starts: State  # every leaf (size, ...)
+    first: jax.Array  # () int32, where the oldest one is
+    left: jax.Array  # () int32, how many are not used yet
+    key: jax.Array  # (2,) uint32, of the next ones
 
 
 @struct.dataclass
@@ -38,9 +48,7 @@ class RolloutState:
     episode_return: jax.Array  # (B,) sum of rewards so far
     started: jax.Array  # (B,) bool, False until the first reset
     counted: jax.Array  # (B,) bool, False during a staggered first episode, whose length says nothing
-    reserve: State  # fresh starts, every leaf (RESERVE, ...)
-    left: jax.Array  # () int32, how many of them are not used yet
-    key: jax.Array  # (2,) uint32, of the next fresh starts
+    reserve: Reserve
 
 
 @struct.dataclass
@@ -51,16 +59,21 @@ class Ended:
     episode_return: jax.Array
     success: jax.Array
     diverged: jax.Array
+    idle: jax.Array  # bool, worlds that waited for a fresh start
 
 
 class Rollout:
     """Steps B worlds and renews those whose episode is over.
 
+    Only where more episodes end than the reserve holds does a world wait for the next `refill`; what it does
+    meanwhile is marked as truncated, without reward, and so counts for nothing.
+
     Args:
         env: the environment.
         worlds: B.
         capacity: worlds renewed in one pass; None chooses from B and the episode length. Passes repeat
-            while any world waits.
+            while any world waits and the reserve lasts.
+        reserve: fresh starts kept ready, rounded up to a multiple of BATCH; default: one for each world.
         stagger: whether first episodes begin at different ages, so that time limits do not come all at once.
         draw_world: (key, ranges) -> World; default: drawn from the randomizer.
     """
@@ -70,65 +83,73 @@ class Rollout:
         env: Environment,
         worlds: int,
         capacity: int | None = None,
+        reserve: int | None = None,
         stagger: bool = True,
         draw_world: DrawWorld | None = None,
     ) -> None:
         self.env = env
         self.worlds = worlds
         wanted = capacity or max(4, math.ceil(2 * worlds / env.episode_steps))
-        self.capacity = min(worlds, wanted, RESERVE)
+        self.capacity = min(worlds, wanted)
+        self.reserve = BATCH * math.ceil((reserve or worlds) / BATCH)
         self.stagger = stagger
         builder = env.randomizer
         self.draw_world = draw_world or (lambda key, ranges: builder.build(builder.sample(key, ranges)))
 
     def start(self, key: jax.Array) -> RolloutState:
-        """B worlds that wait for their first reset, which the first `renew` gives them."""
+        """B worlds that wait for their first reset, which `refill` and `renew` give them."""
         shape = jax.eval_shape(self.env.reset, key)
 
         def empty(rows: int) -> State:
             return jax.tree.map(lambda leaf: jnp.zeros((rows, *leaf.shape), leaf.dtype), shape)
 
-        env = empty(self.worlds)
+        env, none = empty(self.worlds), jnp.zeros((), jnp.int32)
         return RolloutState(
             env=dataclasses.replace(env, done=jnp.ones_like(env.done)),
             episode_return=jnp.zeros_like(env.reward),
             started=jnp.zeros(self.worlds, bool),
             counted=jnp.zeros(self.worlds, bool),
-            reserve=empty(RESERVE),
-            left=jnp.zeros((), jnp.int32),
-            key=key,
+            reserve=Reserve(starts=empty(self.reserve), first=none, left=none, key=key),
         )
 
-    def renew(self, state: RolloutState, ranges: Ranges) -> RolloutState:
-        """Gives every world whose episode is over a fresh World and a fresh start state."""
-
-        def waiting(state: RolloutState) -> jax.Array:
-            return jnp.any(state.env.done > 0)
-
-        def one_pass(state: RolloutState) -> RolloutState:
-            state = jax.lax.cond(state.left == 0, lambda s: self._fill(s, ranges), lambda s: s, state)
-            return self._hand_out(state)
-
-        return jax.lax.while_loop(waiting, one_pass, state)
-
-    def _fill(self, state: RolloutState, ranges: Ranges) -> RolloutState:
-        """Makes RESERVE fresh starts."""
+    def refill(self, reserve: Reserve, ranges: Ranges) -> Reserve:
+        """Makes fresh starts, each in a World of its own, until no more fit."""
 
         def fresh(key: jax.Array) -> State:
             world_key, start_key = jax.random.split(key)
             return self.env.reset(start_key, world=self.draw_world(world_key, ranges))
 
-        key, fill_key = jax.random.split(state.key)
-        reserve = jax.vmap(fresh)(jax.random.split(fill_key, RESERVE))
-        return dataclasses.replace(state, reserve=reserve, left=jnp.asarray(RESERVE, jnp.int32), key=key)
+        def fits(reserve: Reserve) -> jax.Array:
+            return reserve.left + BATCH <= self.reserve
+
+        def fill(reserve: Reserve) -> Reserve:
+            key, fill_key = jax.random.split(reserve.key)
+            made = jax.vmap(fresh)(jax.random.split(fill_key, BATCH))
+            # The place of the next ones is a multiple of BATCH from the beginning, so that they lie together.
+            place = (reserve.first + reserve.left) % self.reserve
+            starts = jax.tree.map(
+                lambda all_, new: jax.lax.dynamic_update_slice_in_dim(all_, new, place, 0),
+                reserve.starts,
+                made,
+            )
+            return Reserve(starts=starts, first=reserve.first, left=reserve.left + BATCH, key=key)
+
+        return jax.lax.while_loop(fits, fill, reserve)
+
+    def renew(self, state: RolloutState) -> RolloutState:
+        """Gives every world whose episode is over a fresh World and a fresh start, while there are any."""
+
+        def waiting(state: RolloutState) -> jax.Array:
+            return jnp.any(state.env.done > 0) & (state.reserve.left > 0)
+
+        return jax.lax.while_loop(waiting, self._hand_out, state)
 
     def _hand_out(self, state: RolloutState) -> RolloutState:
         """Starts the first worlds that wait, `capacity` of them or as many as are in reserve."""
-        order = np.arange(self.capacity)
+        reserve, order = state.reserve, np.arange(self.capacity)
         (rows,) = jnp.nonzero(state.env.done > 0, size=self.capacity, fill_value=self.worlds)
-        rows = jnp.where(order < state.left, rows, self.worlds)  # out of bounds: dropped
-        slots = jnp.maximum(state.left - 1 - order, 0)
-        env = jax.tree.map(lambda leaf: leaf[slots], state.reserve)
+        rows = jnp.where(order < reserve.left, rows, self.worlds)  # out of bounds: dropped
+        env = jax.tree.map(lambda leaf: leaf[(reserve.first + order) % self.reserve], reserve.starts)
 
         counted = state.started[rows] | (not self.stagger)
         age_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(env.key, _STAGGER)
@@ -138,13 +159,16 @@ class Rollout:
         def put(old: jax.Array, new: jax.Array | float | bool) -> jax.Array:
             return old.at[rows].set(new, mode="drop")
 
+        used = jnp.sum(rows < self.worlds, dtype=jnp.int32)
         return dataclasses.replace(
             state,
             env=jax.tree.map(put, state.env, env),
             episode_return=put(state.episode_return, 0.0),
             started=put(state.started, True),
             counted=put(state.counted, counted),
-            left=state.left - jnp.sum(rows < self.worlds, dtype=jnp.int32),
+            reserve=dataclasses.replace(
+                reserve, first=(reserve.first + used) % self.reserve, left=reserve.left - used
+            ),
         )
 
     def step(self, state: RolloutState, action: jax.Array) -> tuple[RolloutState, Ended]:
@@ -152,15 +176,23 @@ class Rollout:
         those whose episode ended.
 
         Args:
-            state: all worlds, none of them done.
+            state: all worlds.
             action: (B, actions).
         """
+        idle = state.env.done > 0
         env = jax.vmap(self.env.step)(state.env, action)
+        env = dataclasses.replace(
+            env,
+            reward=jnp.where(idle, 0, env.reward),
+            done=jnp.where(idle, 1, env.done),
+            info=env.info | {"truncation": jnp.where(idle, 1, env.info["truncation"])},
+        )
         episode_return = state.episode_return + env.reward
         ended = Ended(
-            done=(env.done > 0) & state.counted,
+            done=(env.done > 0) & state.counted & ~idle,
             episode_return=episode_return,
             success=env.info["success"],
-            diverged=env.info["diverged"],
+            diverged=jnp.where(idle, 0, env.info["diverged"]),
+            idle=idle,
         )
         return dataclasses.replace(state, env=env, episode_return=episode_return), ended

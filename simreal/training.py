@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 TARGET_EPOCHS = 3
 """Epochs in a row that must reach `target_success` before training ends early."""
 
+IDLE_SHARE = 0.01
+"""Share of steps waiting for a fresh start that the user is told about."""
+
 
 def make_environment(config: RunConfig, engine: str | None = None) -> Environment:
     """The environment of a run, bound to its training ranges.
@@ -114,6 +117,7 @@ class _Loop:
         self.state: TrainingState = learner.init(config.seed)
         self.rows: list[dict[str, Any]] = []
         self.saved_step: int | None = None
+        self.told_idle = False
 
     @property
     def step(self) -> int:
@@ -168,8 +172,7 @@ class _Loop:
     def epoch(self, began: float) -> dict[str, Any]:
         """One epoch and its row in metrics.jsonl."""
         start, before = time.monotonic(), self.step
-        self.state, metrics = self.learner.epoch(self.state)
-        values = {name: float(value) for name, value in jax.device_get(metrics).items()}
+        self.state, values = self.learner.epoch(self.state)
         if not _is_finite(self.state):
             raise UserError(
                 f"{self.run.folder}: parameters are no longer finite after step {before:,}; {self.kept()}; "
@@ -184,6 +187,12 @@ class _Loop:
             "wall_seconds": now - began,
             **values,
         }
+        if values["idle_steps"] > IDLE_SHARE * (self.step - before) and not self.told_idle:
+            self.told_idle = True
+            self.progress.say(
+                f"{values['idle_steps'] / (self.step - before):.0%} of the steps waited for a fresh start, "
+                "because episodes are shorter than an unroll; a larger rollout.reserve avoids it"
+            )
         self.run.add_metrics(row)
         self.rows.append(row)
         return row

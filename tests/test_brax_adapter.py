@@ -108,10 +108,12 @@ def test_benchmark_evaluates_as_brax_does():
         key=eval_key,
     )
     benchmark = script("benchmarks/against_brax.py")
-    run, keys = benchmark.episodes(learner, worlds), benchmark.evaluation_keys(seed)
+    begin, run = map(jax.jit, benchmark.evaluation(learner, worlds))
+    key = benchmark.evaluation_key(seed)
     for _ in range(2):
         theirs = evaluator.run_evaluation((state.normalizer, state.params.policy, state.params.value), {})
-        ours, success = run(state.params.policy, state.normalizer, next(keys))
+        key, starts = begin(key)
+        ours, success = run(state.params.policy, state.normalizer, starts)
         assert float(ours.std()) > 0
         np.testing.assert_allclose(float(ours.mean()), theirs["eval/episode_reward"], rtol=1e-4)
         np.testing.assert_allclose(float(ours.std()), theirs["eval/episode_reward_std"], rtol=1e-4)

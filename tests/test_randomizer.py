@@ -51,12 +51,13 @@ def episode_starts(name, worlds=256, at_least=2_000):
     """Draws of worlds as a rollout meets them, episode after episode, and whether the model is unchanged."""
     env = environment(name)
     rollout = Rollout(env, worlds, capacity=worlds)
-    renew = jax.jit(rollout.renew)
+    refill, renew = jax.jit(rollout.refill), jax.jit(rollout.renew)
     before = model_bytes(env.mj_model)
     state = rollout.start(jax.random.PRNGKey(3))
     draws, simultaneous = [], []
     while len(draws) * worlds < at_least:
-        state = renew(state, env.randomizer.ranges)
+        reserve = refill(state.reserve, env.randomizer.ranges)
+        state = renew(dataclasses.replace(state, reserve=reserve))
         draws.append(jax.tree.map(np.asarray, state.env.world.draws))
         simultaneous.append(np.asarray(state.env.world.number))
         # All episodes end: the next renewal draws them all anew.

@@ -9,8 +9,8 @@ world changes and not at every step.
 from __future__ import annotations
 
 import ctypes
-import dataclasses
 import functools
+import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,15 +18,18 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import batch as mujoco_batch
 
 from simreal.engines.base import Data, Engine, Inputs, Physics, refuse_gradient
 from simreal.runs import cpu_affinity
-from simreal.world import World
+from simreal.world import Layout, World, pack, unpack
 
 _STATE = ("time", "qpos", "qvel", "act", "qacc_warmstart")
+_LIMIT = "limit "
+"""Before the names of `Inputs.limits`, where all that a step is given lies together."""
 
 
 class _Rows:
@@ -42,12 +45,13 @@ class _Rows:
         self.push = self.batch.bind("xfrc_applied") if engine.push_body is not None else None
         self.timestep = self.batch.expand("opt.timestep") if engine.varies_period else None
 
-    def write_worlds(self, numbers: np.ndarray, fields: dict[str, np.ndarray]) -> None:
-        changed = self.fresh | (numbers != self.numbers).any(axis=1)
-        if not changed.any():
+    def write_worlds(self, numbers: np.ndarray, packed: np.ndarray, layout: Layout) -> None:
+        """Writes the model fields of the rows whose World is not the one they were last written from."""
+        (changed,) = np.nonzero(self.fresh | (numbers != self.numbers).any(axis=1))
+        if not changed.size:
             return
-        for name, view in self.fields.items():
-            view[changed] = fields[name].reshape(view.shape)[changed]
+        for name, value in unpack(packed[changed], layout).items():
+            self.fields[name][changed] = value
         self.numbers[changed] = numbers[changed]
         self.fresh[:] = False
 
@@ -62,6 +66,9 @@ class MujocoEngine(Engine):
         _quiet_log()
         # A world that blows up shall come back not finite, not silently reset to qpos0.
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        if not _has_constraints(self.model, self.varied):
+            # Looking for none costs a fifth of a step of a small model.
+            self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
         self.outputs = ("actuator_force", "actuator_velocity", *self.data_fields)
         self._idle: dict[int, list[_Rows]] = {}
         self._lock = threading.Lock()
@@ -69,11 +76,20 @@ class MujocoEngine(Engine):
         self._shapes = {name: probe.bind(name).shape[1:] for name in (*_STATE, *self.outputs)}
 
     def forward(self, world: World, physics: Physics) -> Data:
-        out = self._call(self._host_forward, self.outputs, world, physics, None)
-        return self._data(physics, out)
+        names = tuple(name for name in self.outputs if name != "actuator_force")
+        out = self._call(self._host_forward, names, world, {}, physics)
+        # No force has acted yet; the row still holds that of whatever it stepped last.
+        none = jnp.zeros(self._shapes["actuator_force"], physics.qpos.dtype)
+        return self._data(physics, out | {"actuator_force": none})
 
     def step(self, world: World, physics: Physics, inputs: Inputs) -> tuple[Physics, Data]:
-        out = self._call(self._host_step, (*_STATE, *self.outputs), world, physics, inputs)
+        given = {"controls": inputs.controls}
+        given |= {_LIMIT + name: value for name, value in inputs.limits.items()}
+        if inputs.push is not None:
+            given["push"] = inputs.push
+        if inputs.period_scale is not None:
+            given["period_scale"] = inputs.period_scale
+        out = self._call(self._host_step, (*_STATE, *self.outputs), world, given, physics)
         moved = Physics(**{name: out[name] for name in _STATE})
         return moved, self._data(moved, out)
 
@@ -89,48 +105,68 @@ class MujocoEngine(Engine):
 
     def _call(
         self,
-        host: Callable[..., dict[str, np.ndarray]],
+        host: Callable[[_Rows, dict[str, np.ndarray]], None],
         names: tuple[str, ...],
         world: World,
+        given: dict[str, jax.Array],
         physics: Physics,
-        inputs: Inputs | None,
     ) -> dict[str, jax.Array]:
+        """Calls `host` with all worlds, whose state is set; returns what it left under `names`.
+
+        Each array that crosses to the host and back has its price, so few do: numbers are packed into one.
+        """
         dtype = physics.qpos.dtype
-        shapes = {name: jax.ShapeDtypeStruct(self._shapes[name], dtype) for name in names}
-        physics = dataclasses.replace(physics, qpos=refuse_gradient(physics.qpos))
-        model = {name: world.model[name] for name in self.varied}
-        if inputs is not None:
-            inputs = jax.tree.map(refuse_gradient, inputs)
-        return jax.pure_callback(
-            host, shapes, world.number, model, physics, inputs, vmap_method="broadcast_all"
+        given = given | {name: getattr(physics, name) for name in _STATE}
+        given = {name: jnp.asarray(value, dtype) for name, value in given.items()}
+        layout_in = tuple((name, given[name].shape) for name in sorted(given))
+        layout_out = tuple((name, self._shapes[name]) for name in names)
+        size = sum(math.prod(shape) for _, shape in layout_out)
+        call = functools.partial(self._host, host, world.layout, layout_in, names)
+        packed = jax.pure_callback(
+            call,
+            jax.ShapeDtypeStruct((size,), dtype),
+            world.number,
+            world.packed,
+            refuse_gradient(pack(given)),
+            vmap_method="broadcast_all",
         )
+        return unpack(packed, layout_out)
 
     # -- on the host: NumPy only, for a JAX call in here can deadlock ---------------------------------------
 
-    def _host_forward(
-        self, number: Any, model: dict, physics: Physics, inputs: None
-    ) -> dict[str, np.ndarray]:
-        with self._rows(number, model, physics) as (rows, lead, dtype):
-            rows.state["ctrl"][:] = 0
-            rows.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
-            out = _collect(rows.outputs, lead, dtype)
-            # No force has acted yet; the row still holds that of whatever it stepped last.
-            return out | {"actuator_force": np.zeros_like(out["actuator_force"])}
+    def _host(
+        self,
+        host: Callable[[_Rows, dict[str, np.ndarray]], None],
+        layout_world: Layout,
+        layout_in: Layout,
+        names: tuple[str, ...],
+        number: Any,
+        model: Any,
+        packed: Any,
+    ) -> np.ndarray:
+        number, model, packed = np.asarray(number), np.asarray(model), np.asarray(packed)
+        lead = number.shape[:-1]
+        n = math.prod(lead)
+        with self._rows(n) as rows:
+            rows.write_worlds(number.reshape(n, 2), model.reshape(n, -1), layout_world)
+            given = unpack(packed.reshape(n, -1), layout_in)
+            for name in _STATE:
+                rows.state[name][:] = given[name].reshape(rows.state[name].shape)
+            host(rows, given)
+            left = [(rows.state | rows.outputs)[name].reshape(n, -1) for name in names]
+            return np.concatenate(left, axis=1, dtype=packed.dtype, casting="same_kind").reshape(*lead, -1)
 
-    def _host_step(self, number: Any, model: dict, physics: Physics, inputs: Inputs) -> dict[str, np.ndarray]:
-        with self._rows(number, model, physics) as (rows, lead, dtype):
-            n = rows.numbers.shape[0]
-            controls = np.asarray(inputs.controls)
-            controls = controls.reshape(n, controls.shape[-2], -1)
-            if rows.push is not None:
-                push = 0.0 if inputs.push is None else np.asarray(inputs.push).reshape(n, 3)
-                rows.push[:, self.push_body, :3] = push
-            if rows.timestep is not None:
-                scale = 1.0 if inputs.period_scale is None else np.asarray(inputs.period_scale).reshape(n)
-                rows.timestep[:] = self.model.opt.timestep * scale
-            limits = {k: np.asarray(v).reshape(n, -1) for k, v in inputs.limits.items()}
-            self._advance(rows, controls, limits)
-            return _collect({**{k: rows.state[k] for k in _STATE}, **rows.outputs}, lead, dtype)
+    def _host_forward(self, rows: _Rows, given: dict[str, np.ndarray]) -> None:
+        rows.state["ctrl"][:] = 0
+        rows.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL)
+
+    def _host_step(self, rows: _Rows, given: dict[str, np.ndarray]) -> None:
+        if rows.push is not None:
+            rows.push[:, self.push_body, :3] = given.get("push", 0.0)
+        if rows.timestep is not None:
+            rows.timestep[:] = self.model.opt.timestep * given.get("period_scale", 1.0)
+        limits = {name.removeprefix(_LIMIT): v for name, v in given.items() if name.startswith(_LIMIT)}
+        self._advance(rows, given["controls"], limits)
 
     def _advance(self, rows: _Rows, controls: np.ndarray, limits: dict[str, np.ndarray]) -> None:
         ctrl, velocity_stage = rows.state["ctrl"], mujoco.mjtStage.mjSTAGE_VEL
@@ -149,31 +185,36 @@ class MujocoEngine(Engine):
             rows.batch.step(nstep=1, stage=velocity_stage if last else mujoco.mjtStage.mjSTAGE_NONE)
 
     @contextmanager
-    def _rows(
-        self, number: Any, model: dict, physics: Physics
-    ) -> Iterator[tuple[_Rows, tuple[int, ...], Any]]:
-        """A batch of the right size, its model rows and states written; not shared with another thread."""
-        number = np.asarray(number)
-        lead = number.shape[:-1]
-        nsim = int(np.prod(lead, dtype=int))
+    def _rows(self, nsim: int) -> Iterator[_Rows]:
+        """A batch of the right size; not shared with another thread."""
         with self._lock:
             idle = self._idle.setdefault(nsim, [])
             rows = idle.pop() if idle else None
         if rows is None:
             rows = _Rows(self, nsim)
         try:
-            rows.write_worlds(number.reshape(nsim, 2), {k: np.asarray(v) for k, v in model.items()})
-            for name in _STATE:
-                view = rows.state[name]
-                view[:] = np.asarray(getattr(physics, name)).reshape(view.shape)
-            yield rows, lead, np.asarray(physics.qpos).dtype
+            yield rows
         finally:
             with self._lock:
                 self._idle[nsim].append(rows)
 
 
-def _collect(views: dict[str, np.ndarray], lead: tuple[int, ...], dtype: Any) -> dict[str, np.ndarray]:
-    return {name: view.astype(dtype).reshape(lead + view.shape[1:]) for name, view in views.items()}
+def _has_constraints(model: mujoco.MjModel, varied: tuple[str, ...]) -> bool:
+    """Whether contacts, limits, equalities or dry friction can ever act in some World of a model."""
+    can_collide = np.bitwise_or.reduce(model.geom_contype, initial=0) & np.bitwise_or.reduce(
+        model.geom_conaffinity, initial=0
+    )
+    return bool(
+        can_collide
+        or model.npair
+        or model.nflex
+        or model.neq
+        or model.jnt_limited.any()
+        or model.tendon_limited.any()
+        or model.dof_frictionloss.any()
+        or model.tendon_frictionloss.any()
+        or {"dof_frictionloss", "tendon_frictionloss"} & set(varied)
+    )
 
 
 class _LogConfig(ctypes.Structure):
