@@ -117,7 +117,7 @@ def evaluation_key(seed: int):
 
 
 def evaluation(learner, worlds: int = EVALUATION_WORLDS):
-    """Programs key -> (key, starts), and (policy, normalizer, starts) -> returns (worlds,), success (worlds,).
+    """Programs key -> (key, starts), and (policy, normalizer, starts) -> returns and success, (worlds,) each.
 
     Of the mean action, in the worlds that Brax's `Evaluator` draws from the same key, as much work as its:
     all worlds are stepped to the time limit.

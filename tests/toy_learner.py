@@ -6,6 +6,7 @@ As a program it trains: `toy_learner.py OUT [--resume] [--kill-at STEP] [--pause
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import signal
 import sys
@@ -58,7 +59,7 @@ class ToyLearner:
             {"weights": jnp.zeros((3, 2))}, jnp.ones(2), jax.random.PRNGKey(seed), jnp.zeros((), jnp.uint32)
         )
 
-    def epoch(self, state: ToyState) -> tuple[ToyState, dict[str, jax.Array]]:
+    def epoch(self, state: ToyState) -> tuple[ToyState, dict[str, float]]:
         time.sleep(self.pause)
         key, noise_key = jax.random.split(state.key)
         weights = state.params["weights"] * 0.9 + jax.random.normal(noise_key, (3, 2))
@@ -68,9 +69,10 @@ class ToyLearner:
         if steps == self.kill_at:
             os.kill(os.getpid(), signal.SIGKILL)
         metrics = {
-            "episode_return": jnp.where(steps > STEPS_PER_EPOCH, jnp.sum(weights), jnp.nan),
-            "success_rate": steps / self.config.steps,
-            "episodes": jnp.asarray(4.0),
+            "episode_return": float(jnp.sum(weights)) if steps > STEPS_PER_EPOCH else math.nan,
+            "success_rate": float(steps) / self.config.steps,
+            "episodes": 4.0,
+            "idle_steps": 0.0,
         }
         return ToyState({"weights": weights}, state.normalizer, key, steps), metrics
 
