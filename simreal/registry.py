@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 from typing import TYPE_CHECKING, Any
 
 from simreal.errors import UserError, nearest
@@ -41,4 +42,9 @@ def make(name: str, **options: Any) -> Environment:
     Raises:
         UserError: an unknown name, or an option that does not fit.
     """
-    return environment_class(name)(**options)
+    kind = environment_class(name)
+    known = [p for p in inspect.signature(kind).parameters if p != "self"]
+    for option in options:
+        if option not in known:
+            raise UserError(f"make({name!r}): unknown option {option!r}; {nearest(option, known)}")
+    return kind(**options)

@@ -214,6 +214,11 @@ def test_a_reset_does_not_remember_what_the_row_did_before():
     assert not again.actuator_force.any()
 
 
+def test_unknown_options():
+    with pytest.raises(simreal.UserError, match="unknown option 'egnine'; did you mean 'engine'"):
+        simreal.make("cartpole_swingup", egnine="mjx")
+
+
 def test_unknown_engine():
     with pytest.raises(simreal.UserError, match="valid: auto, mujoco, mjx"):
         simreal.make("cartpole_swingup", engine="bullet")
