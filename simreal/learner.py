@@ -113,7 +113,7 @@ class Learner:
 
     @functools.cached_property
     def _programs(self) -> _Programs:
-        """Compiled at first use, side by side: it takes about as long as the longest of them."""
+        """Compiled at first use, the longest first, each while the next one is traced."""
         state = self.state_shape
         assert isinstance(state.rollout, RolloutState)
         with SideBySide() as compile_:
@@ -160,7 +160,7 @@ class Learner:
         return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x)), state)
 
     def epoch(self, state: TrainingState) -> tuple[TrainingState, dict[str, float]]:
-        """`iterations_per_epoch` times collect and update. The state passed in is used up."""
+        """`iterations_per_epoch` times refill, collect and update. The state passed in is used up."""
         programs, rows = self._programs, []
         for _ in range(self.config.learner.iterations_per_epoch):
             rollout = state.rollout
