@@ -1,4 +1,4 @@
-"""JAX's persistent compilation cache, in the user's cache folder; and compiling several programs at once."""
+"""JAX's persistent compilation cache, in the user's cache folder; and compiling while tracing."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def for_rare_use() -> dict[str, Any]:
 class SideBySide:
     """Compiles programs in threads while others are traced; leaving the block waits for all.
 
-    Most of XLA's work on one program is serial, and it lets go of Python's lock. Tracing needs the lock and
-    the caller's settings of JAX, so it happens in the caller's thread.
+    XLA lets go of Python's lock. Tracing needs it, and the caller's settings of JAX, so it happens in the
+    caller's thread.
 
         with SideBySide() as compile_:
             program, result = compile_(function, *shapes)
@@ -71,7 +71,7 @@ class SideBySide:
     """
 
     def __init__(self) -> None:
-        # XLA itself uses a second core for part of its work.
+        # XLA keeps nearly two cores busy with one program.
         from simreal.runs import cpu_affinity
 
         self._pool = ThreadPoolExecutor(max(1, len(cpu_affinity()) // 2), thread_name_prefix="compile")

@@ -191,7 +191,7 @@ class _Loop:
             self.told_idle = True
             self.progress.say(
                 f"{values['idle_steps'] / (self.step - before):.0%} of the steps waited for a fresh start, "
-                "because episodes are shorter than an unroll; a larger rollout.reserve avoids it"
+                "because more episodes ended in an unroll than rollout.reserve holds; a larger one avoids it"
             )
         self.run.add_metrics(row)
         self.rows.append(row)

@@ -74,7 +74,8 @@ class World:
 
 def pack(arrays: Mapping[str, jax.Array]) -> jax.Array:
     """Arrays of one dtype as a flat one, in the order of their names."""
-    return jnp.concatenate([jnp.zeros(0), *(arrays[name].reshape(-1) for name in sorted(arrays))])
+    flat = [arrays[name].reshape(-1) for name in sorted(arrays)]
+    return jnp.concatenate(flat) if flat else jnp.zeros(0)
 
 
 def unpack(packed: Any, layout: Layout) -> dict[str, Any]:

@@ -67,7 +67,7 @@ class MujocoEngine(Engine):
         # A world that blows up shall come back not finite, not silently reset to qpos0.
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         if not _has_constraints(self.model, self.varied):
-            # Looking for none costs a fifth of a step of a small model.
+            # Looking for them costs a sixth of a step of a small model.
             self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
         self.outputs = ("actuator_force", "actuator_velocity", *self.data_fields)
         self._idle: dict[int, list[_Rows]] = {}
