@@ -14,10 +14,11 @@ import pytest
 from simreal.checkpoints import Checkpoints
 from simreal.runs import Run
 
+STEPS = 12_800
 OPTIONS = (
     "--worlds 16 --rollout.greedy_worlds 4 --learner.unroll_length 8 --learner.iterations_per_epoch 1 "
     "--learner.epochs 1 --network.policy_layers [16] --network.value_layers [16] "
-    "--checkpoint.every_seconds 0.2 --steps 12800"
+    f"--checkpoint.every_seconds 0.2 --steps {STEPS}"
 )
 """100 epochs of 128 steps: episodes end in them, so that worlds are drawn anew between the checkpoints."""
 
@@ -37,11 +38,11 @@ def finish(process: subprocess.Popen[str]) -> None:
     assert process.returncode == 0, errors
 
 
-def kill_after(process: subprocess.Popen[str], out: Path, step: int, seconds: float) -> None:
-    """SIGKILL some time after the first checkpoint beyond a step."""
+def kill_beyond(process: subprocess.Popen[str], out: Path, step: int, seconds: float) -> None:
+    """SIGKILL `seconds` after the first row of metrics beyond a step, and not before the first checkpoint."""
     deadline = time.monotonic() + 300
-    checkpoints = Checkpoints(Run(out).checkpoints)
-    while max(checkpoints.steps(), default=0) <= step:
+    run = Run(out)
+    while not Checkpoints(run.checkpoints).steps() or last_step(run) <= step:
         assert process.poll() is None, process.communicate()[1]
         assert time.monotonic() < deadline
         time.sleep(0.01)
@@ -49,6 +50,10 @@ def kill_after(process: subprocess.Popen[str], out: Path, step: int, seconds: fl
     process.send_signal(signal.SIGKILL)
     process.communicate(timeout=60)
     assert process.returncode == -signal.SIGKILL, "the run was over before it could be killed"
+
+
+def last_step(run: Run) -> int:
+    return max((row["step"] for row in run.metrics()), default=0)
 
 
 @pytest.mark.slow
@@ -59,12 +64,14 @@ def test_three_kills_do_not_change_a_bit(
     monkeypatch.setenv("SIMREAL_CACHE", str(tmp_path / "cache"))
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     finish(start(engine, whole))
-    moments = np.random.default_rng().uniform(0.0, 0.6, 3)
-    print("kills", moments, "s after a checkpoint")
-    for i, seconds in enumerate(moments):
-        last = max(Checkpoints(Run(broken).checkpoints).steps(), default=0)
+    # In steps, not in seconds: a fast machine is through before a clock that suits a slow one.
+    draw = np.random.default_rng()
+    moments = (draw.uniform([0.05, 0.3, 0.55], [0.25, 0.5, 0.75]) * STEPS).astype(int)
+    delays = draw.uniform(0.0, 0.03, 3)
+    print("kills beyond the steps", moments, "after", delays, "s")
+    for i, (step, seconds) in enumerate(zip(moments, delays, strict=True)):
         process = start(engine, broken, *(["--resume"] if i else []))
-        kill_after(process, broken, last, seconds)
+        kill_beyond(process, broken, step, seconds)
     finish(start(engine, broken, "--resume"))
 
     assert Run(broken).manifest()["cpu_affinity"] == Run(whole).manifest()["cpu_affinity"]

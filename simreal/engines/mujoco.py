@@ -69,6 +69,9 @@ class MujocoEngine(Engine):
         if not _has_constraints(self.model, self.varied):
             # Looking for them costs a sixth of a step of a small model.
             self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+        if self.model.ntree <= 1:
+            # All constraints of one tree are one island: looking for more costs a tenth of a Go2's step.
+            self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
         self.outputs = ("actuator_force", "actuator_velocity", *self.data_fields)
         self._idle: dict[int, list[_Rows]] = {}
         self._lock = threading.Lock()
