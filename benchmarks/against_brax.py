@@ -154,7 +154,7 @@ def run_simreal(plan: Plan, seed: int, record: Record) -> None:
     """simreal's learner."""
     import jax
 
-    from simreal.compilation import SideBySide, for_rare_use
+    from simreal.compilation import SideBySide, for_rare_use, for_short_use
     from simreal.learner import Learner
 
     config = plan.config(seed)
@@ -165,7 +165,11 @@ def run_simreal(plan: Plan, seed: int, record: Record) -> None:
     shape, (begin, run) = learner.state_shape, evaluation(learner)
     with SideBySide() as compile_:
         started, (_, starts) = compile_(begin, shape.key, compiler_options=for_rare_use())
-        ran, _ = compile_(run, shape.params.policy, shape.normalizer, starts)
+        ran, _ = compile_(
+            run,
+            *(shape.params.policy, shape.normalizer, starts),
+            compiler_options=for_short_use(env.engine_name),
+        )
         state = jax.block_until_ready(learner.init(seed))
     begin, run, key = started.result(), ran.result(), evaluation_key(seed)
     record.mark("set-up")

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from simreal.compilation import for_rare_use, for_short_use
 from simreal.environment import Environment, State
 from simreal.errors import UserError, nearest
 from simreal.evaluation.ranges import sweep_values
@@ -54,8 +55,8 @@ class Evaluator:
         self.policy = policy
         self.seed = seed
         self.batch = batch
-        self._build = jax.jit(jax.vmap(env.randomizer.build))
-        self._episodes = jax.jit(self._run_episodes)
+        self._build = jax.jit(jax.vmap(env.randomizer.build), compiler_options=for_rare_use())
+        self._episodes = jax.jit(self._run_episodes, compiler_options=for_short_use(env.engine_name))
 
     # -- what can be asked ---------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from simreal.compilation import for_rare_use, for_short_use
 from simreal.environment import Environment
 from simreal.evaluation.evaluator import POLICY_KEY, Draws, PolicyLike
 
@@ -30,7 +31,8 @@ def record(env: Environment, policy: PolicyLike, draws: Draws, index: int, seed:
     """The episode that the evaluator ran in world `index` of a set with these draws."""
     world = env.randomizer.build({name: jnp.asarray(value[index]) for name, value in draws.items()})
     key = jax.random.fold_in(jax.random.PRNGKey(seed), index)
-    reset, step = jax.jit(lambda key, world: env.reset(key, world=world)), jax.jit(env.step)
+    reset = jax.jit(lambda key, world: env.reset(key, world=world), compiler_options=for_rare_use())
+    step = jax.jit(env.step, compiler_options=for_short_use(env.engine_name))
 
     @jax.jit
     def act(state: Any, memory: Any) -> tuple[Any, Any]:
