@@ -21,6 +21,7 @@ FEET = ("FR", "FL", "RR", "RL")
 JOINTS = tuple(f"{leg}_{joint}" for leg in FEET for joint in ("hip", "thigh", "calf"))
 HOME = np.array([0.0, 0.9, -1.8] * 4)  # rad, the model's keyframe "home"
 ACTION_SCALE = 0.3  # rad
+DRY_FRICTION = 0.2  # N m, from the Menagerie's go2.xml; go2_mjx.xml leaves it out
 FOOT_RADIUS = 0.022  # m
 CLEARANCE = 0.04  # m, a foot that moves shall be lifted by this much
 TOUCH = 0.003  # m, a foot closer to the floor than this stands on it
@@ -103,6 +104,7 @@ class Go2Walk(Environment):
         for mesh in list(spec.meshes):
             spec.delete(mesh)
         model = spec.compile()
+        model.dof_frictionloss[model.jnt_dofadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = DRY_FRICTION
         self._feet = np.array([model.geom(foot).id for foot in FEET])
         # The joints' order in qpos is not the actuators'.
         joints = model.actuator_trnid[:, 0]
