@@ -61,7 +61,7 @@ def caller(rollout: Rollout, steps: int):
         def one(state, key):
             state = rollout.renew(state)
             action = 0.05 * jax.random.normal(key, (rollout.worlds, rollout.env.action_size))
-            state, _ = rollout.step(state, action)
+            state, _, _ = rollout.step(state, action)
             return state, None
 
         return jax.lax.scan(one, state, jax.random.split(key, steps))[0]

@@ -59,7 +59,7 @@ class Checkpoints:
         import orbax.checkpoint as ocp
 
         # Orbax cannot hold an array of no elements; restoring takes it from the structure.
-        leaves = {name: leaf for name, leaf in _flatten(state).items() if leaf.size}
+        leaves = {name: leaf for name, leaf in flatten(state).items() if leaf.size}
         final = self.folder / str(step)
         draft = self.folder / f"{step}.unfinished"
         try:
@@ -103,7 +103,7 @@ class Checkpoints:
         for step in reversed(self.steps()):
             flaw = _flaw(self.folder / str(step))
             if flaw is None:
-                return step, _unflatten(like, self._read(step), f"{self.folder / str(step)}", partial)
+                return step, unflatten(like, self._read(step), f"{self.folder / str(step)}", partial)
             say(f"checkpoint {self.folder / str(step)} is damaged ({flaw}); falling back to the one before")
         if self.steps():
             raise UserError(f"no usable checkpoint in {self.folder}: all {len(self.steps())} are damaged")
@@ -137,7 +137,7 @@ def _silence() -> Iterator[None]:
         logger.disabled = before
 
 
-def _flatten(tree: Any) -> dict[str, np.ndarray]:
+def flatten(tree: Any) -> dict[str, np.ndarray]:
     """Leaves by their path in the tree, on the host; a typed key becomes its uint32 data."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path): np.asarray(_raw(leaf)) for path, leaf in leaves}
@@ -151,7 +151,18 @@ def _is_key(leaf: Any) -> bool:
     return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _unflatten(like: Tree, saved: dict[str, np.ndarray], where: str, partial: bool) -> Tree:
+def unflatten(like: Tree, saved: dict[str, np.ndarray], where: str, partial: bool = False) -> Tree:
+    """What `flatten` took apart, as a tree of JAX arrays.
+
+    Args:
+        like: of the same structure, arrays or their shapes.
+        saved: leaves by their path.
+        where: named in the error.
+        partial: whether `like` may lack some of what was saved.
+
+    Raises:
+        UserError: other leaves, or other shapes.
+    """
     leaves, structure = jax.tree_util.tree_flatten_with_path(like)
     expected = {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
     for name in expected if partial else [*expected, *saved]:

@@ -1,4 +1,4 @@
-"""The command line: `simreal list | train | evaluate | sweep | doctor`.
+"""The command line: `simreal list | train | evaluate | replay | sweep | doctor`.
 
 Exit codes: 0 done; 2 the input is wrong (one line on stderr); 3 a `--require` does not hold; 130 interrupted.
 JAX is imported only by the commands that compute.
@@ -179,6 +179,20 @@ def _evaluate(given: argparse.Namespace) -> int:
     return REQUIREMENT_FAILED if failures else DONE
 
 
+def _build_replay(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", type=Path, metavar="FILE", help="a file in RUN/quarantine")
+    parser.add_argument("--engine", metavar="NAME", help="auto, mujoco or mjx; default: as in training")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="for the film; default: beside FILE")
+
+
+def _replay(given: argparse.Namespace) -> int:
+    _set_up_jax()
+    from simreal import replaying
+
+    replaying.show(given.file, given.engine, given.out, print)
+    return DONE
+
+
 def _build_sweep(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("sweep", nargs="?", metavar="SWEEP.yaml", help="what to sweep over")
 
@@ -210,6 +224,7 @@ COMMANDS: dict[str, tuple[str, Builder, Callable[[argparse.Namespace], int]]] = 
     "list": ("Show the environments and the shipped configurations.", _build_list, _list),
     "train": ("Train a policy.", _build_train, _train),
     "evaluate": ("Measure a policy on sets of worlds, and write its report.", _build_evaluate, _evaluate),
+    "replay": ("Run a world that blew up in training again, and film it.", _build_replay, _replay),
     "sweep": ("Train over a grid of settings (not in this version).", _build_sweep, _sweep),
     "doctor": ("Show what this machine offers, and what is wrong with it.", _build_doctor, _doctor),
 }

@@ -114,6 +114,8 @@ class RolloutConfig:
     """Whether the first episodes start at different ages, so that ends do not come all at once."""
     greedy_worlds: NonNegativeInt = 32
     """Extra worlds in which the mean action is taken: they give the success rate, and teach nothing."""
+    quarantine_files: NonNegativeInt = 1000
+    """Most worlds whose physics blew up that are written to RUN/quarantine, to be replayed; 0 writes none."""
 
 
 @dataclass(frozen=True, config=SETTINGS)

@@ -37,6 +37,8 @@ Task = Any
 
 MAX_SPEED = 1e3
 """A generalised velocity beyond this (rad/s or m/s) counts as blown up."""
+MAX_SPECIFIC_ENERGY = 1250.0
+"""Kinetic energy per mass of the model beyond this (J/kg; all of it at 50 m/s) counts as blown up."""
 
 
 @struct.dataclass
@@ -158,6 +160,7 @@ class Environment(abc.ABC):
         self.substeps = round(self.control_dt / self.physics_dt)
         self.episode_steps = round(self.episode_length / self.control_dt)
         self.action_size = self.mj_model.nu
+        self._max_energy = MAX_SPECIFIC_ENERGY * float(self.mj_model.body_mass.sum())
         self.observation_size = len(self.observations)
         factors = self.training if randomizer is None else randomizer
         self.actuators = self._make_actuators(factors)
@@ -356,7 +359,7 @@ class Environment(abc.ABC):
         privileged = self._privileged(true_reading, data, task, action, state.world)
 
         # A world that blew up ends its episode; NaN is sticky, so nothing of its new state is kept.
-        fine = jnp.all(jnp.abs(physics.qvel) < MAX_SPEED) & jnp.all(jnp.isfinite(physics.qpos))
+        fine = self._is_fine(physics)
         kept = (obs, privileged, physics, task, actuator, sensor)
         before = (state.obs, state.privileged, state.physics, state.task, state.actuator, state.sensor)
         obs, privileged, physics, task, actuator, sensor = jax.tree.map(
@@ -388,6 +391,16 @@ class Environment(abc.ABC):
             key=key,
             steps=steps,
         )
+
+    def _is_fine(self, physics: Physics) -> jax.Array:
+        """bool: finite, and neither a velocity nor the kinetic energy is beyond belief.
+
+        The energy is that of the nominal inertias in the model's reference pose, without their couplings.
+        """
+        slow = jnp.all(jnp.abs(physics.qvel) < MAX_SPEED)
+        inertia = jnp.asarray(self.mj_model.dof_M0, physics.qvel.dtype)
+        kinetic = 0.5 * jnp.sum(inertia * jnp.square(physics.qvel))
+        return slow & (kinetic < self._max_energy) & jnp.all(jnp.isfinite(physics.qpos))
 
     def _force_limit(self, world: World) -> jax.Array:
         """(nu,) largest force of each actuator; infinite where nothing limits it."""

@@ -27,9 +27,12 @@ from simreal.environment import Environment
 from simreal.networks import make_networks
 from simreal.policy import Policy
 from simreal.randomizer import Ranges
-from simreal.rollout import Ended, Reserve, Rollout, RolloutState
+from simreal.rollout import Ended, Flight, Reserve, Rollout, RolloutState
 
 Metrics = dict[str, jax.Array]
+Watch = Callable[[int, RolloutState, Flight], None]
+"""Called after each unroll with the environment steps before it, all worlds as they were then, and what
+they did, leaves (T, B, ...)."""
 
 _COLLECT, _UPDATE, _NEXT = range(3)  # folded into a run's key: what its randomness is for
 
@@ -54,7 +57,7 @@ class TrainingState:
 class _Programs(NamedTuple):
     start: Callable[[np.uint32], TrainingState]
     refill: Callable[[Reserve, Ranges], Reserve]
-    collect: Callable[..., tuple[RolloutState, types.Transition, Ended]]
+    collect: Callable[..., tuple[RolloutState, types.Transition, Ended, Flight]]
     update: Callable[..., tuple[TrainingState, Metrics]]
 
 
@@ -117,10 +120,9 @@ class Learner:
         state = self.state_shape
         assert isinstance(state.rollout, RolloutState)
         with SideBySide() as compile_:
-            collect, (_, data, ended) = compile_(
-                self.collect,
-                *(state.rollout, state.params.policy, state.normalizer, state.key),
-                donate_argnums=0,
+            # Collect and refill donate nothing: whoever watches keeps the worlds as they were before.
+            collect, (_, data, ended, _) = compile_(
+                self.collect, *(state.rollout, state.params.policy, state.normalizer, state.key)
             )
             update, _ = compile_(
                 self.update, dataclasses.replace(state, rollout=()), data, ended, donate_argnums=0
@@ -128,7 +130,6 @@ class Learner:
             refill, _ = compile_(
                 self.rollout.refill,
                 *(state.rollout.reserve, state.ranges),
-                donate_argnums=0,
                 compiler_options=for_rare_use(),
             )
             seed = jax.ShapeDtypeStruct((), jnp.uint32)
@@ -159,39 +160,46 @@ class Learner:
         # The explicit type takes away weak types, for which the first epoch would compile a second program.
         return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x)), state)
 
-    def epoch(self, state: TrainingState) -> tuple[TrainingState, dict[str, float]]:
+    def epoch(
+        self, state: TrainingState, watch: Watch = lambda steps, before, flight: None
+    ) -> tuple[TrainingState, dict[str, float]]:
         """`iterations_per_epoch` times refill, collect and update. The state passed in is used up."""
         programs, rows = self._programs, []
+        steps = int(state.steps)
         for _ in range(self.config.learner.iterations_per_epoch):
             rollout = state.rollout
             assert isinstance(rollout, RolloutState)  # () only inside `update`
             reserve = programs.refill(rollout.reserve, state.ranges)
-            rollout = dataclasses.replace(rollout, reserve=reserve)
-            rollout, data, ended = programs.collect(rollout, state.params.policy, state.normalizer, state.key)
+            before = dataclasses.replace(rollout, reserve=reserve)
+            rollout, data, ended, flight = programs.collect(
+                before, state.params.policy, state.normalizer, state.key
+            )
             learnt, row = programs.update(dataclasses.replace(state, rollout=()), data, ended)
             state = dataclasses.replace(learnt, rollout=rollout)
             rows.append(row)
+            watch(steps, before, flight)
+            steps += self.worlds * self.config.learner.unroll_length
         return state, _summarise(*jax.device_get((rows, state.last_success)))
 
     # -- collect -------------------------------------------------------------------------------------------
 
     def collect(
         self, rollout: RolloutState, policy: Any, normalizer: Any, key: jax.Array
-    ) -> tuple[RolloutState, types.Transition, Ended]:
+    ) -> tuple[RolloutState, types.Transition, Ended, Flight]:
         """`unroll_length` control steps of all worlds; the learning worlds' data has leaves (T, B, ...)."""
         distribution = self.networks.parametric_action_distribution
         learning = self.worlds
 
         def one_step(
             state: RolloutState, key: jax.Array
-        ) -> tuple[RolloutState, tuple[types.Transition, Ended]]:
+        ) -> tuple[RolloutState, tuple[types.Transition, Ended, Flight]]:
             state = self.rollout.renew(state)
             seen = {"state": state.env.obs, "privileged_state": state.env.privileged}
             logits = self.networks.policy_network.apply(normalizer, policy, seen)
             raw = distribution.sample_no_postprocessing(logits, key)
             greedy = jnp.arange(self.rollout.worlds)[:, None] >= learning
             action = distribution.postprocess(jnp.where(greedy, distribution.create_dist(logits).mode(), raw))
-            state, ended = self.rollout.step(state, action)
+            state, ended, flight = self.rollout.step(state, action)
             env = state.env
             extras = {
                 "policy_extras": {
@@ -209,14 +217,14 @@ class Learner:
                 next_observation=(),
                 extras=extras,
             )
-            return state, (jax.tree.map(lambda x: x[:learning], step), ended)
+            return state, (jax.tree.map(lambda x: x[:learning], step), ended, flight)
 
         keys = jax.random.split(jax.random.fold_in(key, _COLLECT), self.config.learner.unroll_length)
-        rollout, (data, ended) = jax.lax.scan(one_step, rollout, keys)
+        rollout, (data, ended, flight) = jax.lax.scan(one_step, rollout, keys)
         final = {"state": rollout.env.obs, "privileged_state": rollout.env.privileged}
         # The loss reads only the last next observation, to bootstrap from.
         data = data._replace(next_observation=jax.tree.map(lambda x: x[None, :learning], final))
-        return rollout, data, ended
+        return rollout, data, ended, flight
 
     # -- update --------------------------------------------------------------------------------------------
 
@@ -330,7 +338,7 @@ def _count_episodes(ended: Ended, learning: int) -> Metrics:
         "episodes": jnp.sum(done, dtype=float),
         "returns": jnp.sum(jnp.where(done, ended.episode_return[:, :learning], 0)),
         "successes": jnp.sum(jnp.where(done, ended.success[:, :learning], 0)),
-        "diverged": jnp.sum(ended.diverged),
+        "quarantined": jnp.sum(ended.quarantined, dtype=float),
         "idle_steps": jnp.sum(ended.idle, dtype=float),
     }
 

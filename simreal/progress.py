@@ -31,6 +31,7 @@ class Progress:
         self.total = total
         self.every = every
         self._last_line = -math.inf
+        self._quarantined = 0.0
         self._recent: deque[tuple[int, float]] = deque(maxlen=RECENT + 1)
         self._live = Live(console=self.console, auto_refresh=False) if self.console.is_terminal else None
 
@@ -64,6 +65,9 @@ class Progress:
             f"{_count(row['step'])} of {_count(self.total)} steps   "
             f"return {_number(row['episode_return'])}   success {_percent(row['success_rate'])}"
         )
+        self._quarantined += row.get("quarantined") or 0
+        if self._quarantined:
+            line += f"   quarantined {self._quarantined:.0f}"
         (first_step, began), (step, now) = self._recent[0], self._recent[-1]
         if step == first_step or now <= began:  # the first epoch's own speed is that of the compiler
             return line

@@ -48,6 +48,7 @@ class RolloutState:
     episode_return: jax.Array  # (B,) sum of rewards so far
     started: jax.Array  # (B,) bool, False until the first reset
     counted: jax.Array  # (B,) bool, False during a staggered first episode, whose length says nothing
+    origin: jax.Array  # (B,) int32, place in the reserve that the episode was started from
     reserve: Reserve
 
 
@@ -58,8 +59,20 @@ class Ended:
     done: jax.Array  # bool, counted episodes only
     episode_return: jax.Array
     success: jax.Array
-    diverged: jax.Array
     idle: jax.Array  # bool, worlds that waited for a fresh start
+    quarantined: jax.Array  # bool, worlds whose physics blew up: their episode is over, and not counted
+
+
+@struct.dataclass
+class Flight:
+    """What all worlds did in one step, to look at where one blew up; leaves (B, ...)."""
+
+    age: jax.Array  # int32, control steps of the episode, after the step
+    origin: jax.Array  # int32, see RolloutState
+    action: jax.Array  # (B, actions), before it was clipped
+    qpos: jax.Array  # (B, nq) after the step
+    qvel: jax.Array  # (B, nv)
+    quarantined: jax.Array  # bool
 
 
 class Rollout:
@@ -109,6 +122,7 @@ class Rollout:
             episode_return=jnp.zeros_like(env.reward),
             started=jnp.zeros(self.worlds, bool),
             counted=jnp.zeros(self.worlds, bool),
+            origin=jnp.zeros(self.worlds, jnp.int32),
             reserve=Reserve(starts=empty(self.reserve), first=none, left=none, key=key),
         )
 
@@ -149,7 +163,8 @@ class Rollout:
         reserve, order = state.reserve, np.arange(self.capacity)
         (rows,) = jnp.nonzero(state.env.done > 0, size=self.capacity, fill_value=self.worlds)
         rows = jnp.where(order < reserve.left, rows, self.worlds)  # out of bounds: dropped
-        env = jax.tree.map(lambda leaf: leaf[(reserve.first + order) % self.reserve], reserve.starts)
+        places = ((reserve.first + order) % self.reserve).astype(jnp.int32)
+        env = jax.tree.map(lambda leaf: leaf[places], reserve.starts)
 
         counted = state.started[rows] | (not self.stagger)
         age_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(env.key, _STAGGER)
@@ -166,14 +181,18 @@ class Rollout:
             episode_return=put(state.episode_return, 0.0),
             started=put(state.started, True),
             counted=put(state.counted, counted),
+            origin=put(state.origin, places),
             reserve=dataclasses.replace(
                 reserve, first=(reserve.first + used) % self.reserve, left=reserve.left - used
             ),
         )
 
-    def step(self, state: RolloutState, action: jax.Array) -> tuple[RolloutState, Ended]:
+    def step(self, state: RolloutState, action: jax.Array) -> tuple[RolloutState, Ended, Flight]:
         """One control step of all worlds; `renew` first. `state.env.obs` is then the final observation of
         those whose episode ended.
+
+        A world that blew up is marked as truncated, not as failed: its physics is no experience, and what it
+        did before is learnt from with the value of where it was.
 
         Args:
             state: all worlds.
@@ -181,18 +200,28 @@ class Rollout:
         """
         idle = state.env.done > 0
         env = jax.vmap(self.env.step)(state.env, action)
+        quarantined = (env.info["diverged"] > 0) & ~idle
+        unreal = idle | quarantined
         env = dataclasses.replace(
             env,
             reward=jnp.where(idle, 0, env.reward),
             done=jnp.where(idle, 1, env.done),
-            info=env.info | {"truncation": jnp.where(idle, 1, env.info["truncation"])},
+            info=env.info | {"truncation": jnp.where(unreal, 1, env.info["truncation"])},
         )
         episode_return = state.episode_return + env.reward
         ended = Ended(
-            done=(env.done > 0) & state.counted & ~idle,
+            done=(env.done > 0) & state.counted & ~unreal,
             episode_return=episode_return,
             success=env.info["success"],
-            diverged=jnp.where(idle, 0, env.info["diverged"]),
             idle=idle,
+            quarantined=quarantined,
         )
-        return dataclasses.replace(state, env=env, episode_return=episode_return), ended
+        flight = Flight(
+            age=env.steps,
+            origin=state.origin,
+            action=action,
+            qpos=env.physics.qpos,
+            qvel=env.physics.qvel,
+            quarantined=quarantined,
+        )
+        return dataclasses.replace(state, env=env, episode_return=episode_return), ended, flight

@@ -56,6 +56,11 @@ class Run:
         return self.folder / "policy"
 
     @property
+    def quarantine(self) -> Path:
+        """A file for each world that blew up."""
+        return self.folder / "quarantine"
+
+    @property
     def events(self) -> Path:
         """TensorBoard events."""
         return self.folder / "events"

@@ -19,6 +19,7 @@ from simreal.checkpoints import Checkpoints
 from simreal.config import RunConfig
 from simreal.errors import UserError
 from simreal.progress import Progress
+from simreal.quarantine import Recorder
 from simreal.resuming import check_config, check_manifest, take_policy
 from simreal.runs import Run
 from simreal.stopping import Interrupted, StopRequest
@@ -115,9 +116,16 @@ class _Loop:
         self.progress = progress
         self.checkpoints = Checkpoints(run.checkpoints, config.checkpoint.keep)
         self.state: TrainingState = learner.init(config.seed)
+        self.recorder = Recorder(
+            run.quarantine,
+            _recording_meta(learner, config),
+            learner.env.control_dt,
+            config.learner.unroll_length,
+            config.rollout.quarantine_files,
+        )
         self.rows: list[dict[str, Any]] = []
         self.saved_step: int | None = None
-        self.told_idle = False
+        self.told_idle = self.told_quarantine = False
 
     @property
     def step(self) -> int:
@@ -172,7 +180,8 @@ class _Loop:
     def epoch(self, began: float) -> dict[str, Any]:
         """One epoch and its row in metrics.jsonl."""
         start, before = time.monotonic(), self.step
-        self.state, values = self.learner.epoch(self.state)
+        self.state, values = self.learner.epoch(self.state, self.recorder.watch)
+        self.recorder.flush()
         if not _is_finite(self.state):
             raise UserError(
                 f"{self.run.folder}: parameters are no longer finite after step {before:,}; {self.kept()}; "
@@ -187,6 +196,12 @@ class _Loop:
             "wall_seconds": now - began,
             **values,
         }
+        if values["quarantined"] and not self.told_quarantine:
+            self.told_quarantine = True
+            self.progress.say(
+                f"a world's physics blew up; its episode is over and counts for nothing. Such worlds lie in "
+                f"{self.run.quarantine}; 'simreal replay FILE' shows one again"
+            )
         if values["idle_steps"] > IDLE_SHARE * (self.step - before) and not self.told_idle:
             self.told_idle = True
             self.progress.say(
@@ -248,6 +263,17 @@ class _Events:
         for name, value in row.items():
             if name != "step" and math.isfinite(value):
                 self.writer.add_scalar(name, value, row["step"])
+
+
+def _recording_meta(learner: Learner, config: RunConfig) -> dict[str, Any]:
+    """What every recording of a blown world says of its run."""
+    return {
+        "environment": config.environment,
+        "engine": learner.env.engine_name,
+        "seed": config.seed,
+        "randomizer": learner.env.randomizer.randomizer.digest,
+        "config": config.to_dict(),
+    }
 
 
 def _manifest(learner: Learner, config: RunConfig) -> dict[str, Any]:

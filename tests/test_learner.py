@@ -234,7 +234,7 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_counted(acting):
     learner, state = acting
     state = copy(state)
     before = copy(state.params)
-    _, data, ended = learner._programs.collect(
+    _, data, ended, _ = learner._programs.collect(
         state.rollout, state.params.policy, state.normalizer, jax.random.PRNGKey(0)
     )
     data = data._replace(reward=data.reward.at[0, 0].set(jnp.nan))

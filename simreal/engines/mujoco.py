@@ -157,7 +157,9 @@ class MujocoEngine(Engine):
                 rows.state[name][:] = given[name].reshape(rows.state[name].shape)
             host(rows, given)
             left = [(rows.state | rows.outputs)[name].reshape(n, -1) for name in names]
-            return np.concatenate(left, axis=1, dtype=packed.dtype, casting="same_kind").reshape(*lead, -1)
+            with np.errstate(over="ignore"):  # a world that blew up is infinite in single precision
+                flat = np.concatenate(left, axis=1, dtype=packed.dtype, casting="same_kind")
+            return flat.reshape(*lead, -1)
 
     def _host_forward(self, rows: _Rows, given: dict[str, np.ndarray]) -> None:
         rows.state["ctrl"][:] = 0
