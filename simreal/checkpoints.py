@@ -13,7 +13,8 @@ import json
 import logging
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,6 +27,7 @@ from simreal.errors import UserError
 Tree = TypeVar("Tree")
 
 SEAL = "sha256.json"
+SCORE = "score.json"
 ROOM = 2.0
 """Free bytes asked for per byte of state, and `SPARE` more: a disk that fills up while Orbax writes ends in
 pages of traces, so that is seen before."""
@@ -38,11 +40,19 @@ class Checkpoints:
     Args:
         folder: made when the first one is saved.
         keep: how many of the newest stay.
+        keep_every: environment steps; the first checkpoint in each stretch of as many stays for good.
+        keep_best: whether the one with the best score stays.
     """
 
-    def __init__(self, folder: Path, keep: int = 3) -> None:
+    def __init__(
+        self, folder: Path, keep: int = 3, keep_every: int | None = None, keep_best: bool = False
+    ) -> None:
         self.folder = folder
         self.keep = keep
+        self.keep_every = keep_every
+        self.keep_best = keep_best
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
+        self._saving: Future[int] | None = None
 
     def steps(self) -> list[int]:
         """Steps at which there are checkpoints, sound or not, oldest first."""
@@ -50,16 +60,49 @@ class Checkpoints:
             return []
         return sorted(int(path.name) for path in self.folder.iterdir() if path.name.isdecimal())
 
-    def save(self, step: int, state: Any) -> None:
+    def begin_save(self, step: int, state: Any, score: float | None = None) -> None:
+        """`save` in the background, after a copy of the state was taken; waits for the one before.
+
+        Raises:
+            UserError: the one before could not be written.
+        """
+        self.finish()
+        leaves = {name: np.array(leaf) for name, leaf in flatten(state).items()}
+        self._saving = self._pool.submit(self._save, step, leaves, score)
+
+    def finished(self, wait: bool = False) -> int | None:
+        """The step of the save in the background, once, as soon as it is done.
+
+        Raises:
+            UserError: it could not be written.
+        """
+        if self._saving is None or not (wait or self._saving.done()):
+            return None
+        saving, self._saving = self._saving, None
+        return saving.result()
+
+    def finish(self) -> int | None:
+        """`finished`, waited for."""
+        return self.finished(wait=True)
+
+    def save(self, step: int, state: Any, score: float | None = None) -> None:
         """Saves a pytree of arrays; afterwards either all of it is there under this step, or nothing is.
+
+        Args:
+            step: names it.
+            state: of arrays.
+            score: higher is better, for `keep_best`.
 
         Raises:
             UserError: it cannot be written (disk full, no permission); older checkpoints are untouched.
         """
+        self._save(step, flatten(state), score)
+
+    def _save(self, step: int, state: Mapping[str, np.ndarray], score: float | None) -> int:
         import orbax.checkpoint as ocp
 
         # Orbax cannot hold an array of no elements; restoring takes it from the structure.
-        leaves = {name: leaf for name, leaf in flatten(state).items() if leaf.size}
+        leaves = {name: leaf for name, leaf in state.items() if leaf.size}
         final = self.folder / str(step)
         draft = self.folder / f"{step}.unfinished"
         try:
@@ -69,12 +112,12 @@ class Checkpoints:
             _check_room(self.folder, sum(leaf.nbytes for leaf in leaves.values()))
             with _silence(), ocp.Checkpointer(ocp.StandardCheckpointHandler()) as checkpointer:
                 checkpointer.save(draft.absolute() / "state", leaves)
+            (draft / SCORE).write_text(json.dumps(score), encoding="utf-8")
             (draft / SEAL).write_text(json.dumps(_digests(draft), indent=1), encoding="utf-8")
             if final.exists():  # a damaged one that resuming passed over
                 shutil.rmtree(final)
             draft.rename(final)
-            for old in self.steps()[: -self.keep]:
-                shutil.rmtree(self.folder / str(old))
+            self._thin_out()
         except (OSError, ValueError) as error:
             shutil.rmtree(draft, ignore_errors=True)
             reason = _disk_trouble(error)
@@ -83,6 +126,29 @@ class Checkpoints:
             last = max((s for s in self.steps() if s != step), default=None)
             kept = "there is no earlier one" if last is None else f"the one at step {last} is intact"
             raise UserError(f"cannot save a checkpoint in {self.folder}: {reason}; {kept}") from error
+        return step
+
+    def _thin_out(self) -> None:
+        """Removes what neither number, interval nor score keeps."""
+        steps = self.steps()
+        kept = set(steps[-self.keep :])
+        if self.keep_every:
+            stretches: dict[int, int] = {}
+            for step in steps:
+                stretches.setdefault(step // self.keep_every, step)
+            kept |= set(stretches.values())
+        best = self.best()
+        if self.keep_best and best is not None:
+            kept.add(best)
+        for step in steps:
+            if step not in kept:
+                shutil.rmtree(self.folder / str(step))
+
+    def best(self) -> int | None:
+        """The step with the highest score, of equal ones the newest; None where none has a score."""
+        scores = {step: _score(self.folder / str(step)) for step in self.steps()}
+        known = {step: score for step, score in scores.items() if score is not None}
+        return max(known, key=lambda step: (known[step], step), default=None)
 
     def restore(
         self, like: Tree, say: Callable[[str], None], partial: bool = False
@@ -183,6 +249,13 @@ def _revive(like: Any, saved: np.ndarray | None) -> Any:
 
 def _shape(leaf: Any) -> str:
     return f"{np.dtype(leaf.dtype).name}{list(leaf.shape)}"
+
+
+def _score(folder: Path) -> float | None:
+    try:
+        return json.loads((folder / SCORE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):  # older, or damaged
+        return None
 
 
 def _digests(folder: Path) -> dict[str, str]:

@@ -163,6 +163,9 @@ def _build_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--against", type=Path, metavar="RUN", help="compare with this run on the same worlds, in the report"
     )
+    parser.add_argument(
+        "--best", action="store_true", help="the policy that did best in training instead of the last one"
+    )
     parser.add_argument("--json", action="store_true", help="print transfer.json instead of a table")
 
 
@@ -170,7 +173,8 @@ def _evaluate(given: argparse.Namespace) -> int:
     from simreal import evaluating
 
     request = evaluating.Request.parse(
-        given.run, given.sets, given.ranges, given.worlds, given.engine, given.require, given.against
+        *(given.run, given.sets, given.ranges, given.worlds, given.engine, given.require, given.against),
+        best=given.best,
     )
     _set_up_jax()
     failures = evaluating.evaluate(request, as_json=given.json)

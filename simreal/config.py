@@ -126,6 +126,10 @@ class CheckpointConfig:
     """Wall time between two checkpoints, s; the last state is always saved."""
     keep: PositiveInt = 3
     """Newest checkpoints that stay on disk."""
+    keep_every: PositiveInt | None = None
+    """Environment steps of which one checkpoint in each such stretch stays for good; null: none."""
+    keep_best: bool = True
+    """Whether the checkpoint with the highest success rate stays."""
 
 
 @dataclass(frozen=True, config=SETTINGS)

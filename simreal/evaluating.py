@@ -44,6 +44,13 @@ class Request:
     requirements: tuple[Requirement, ...]
     against: Run | None = None
     """Another run of the same environment, whose policy meets the same worlds."""
+    best: bool = False
+    """The policy that did best in training, instead of the last one."""
+
+    @property
+    def policy(self) -> Path:
+        """Where the policy lies."""
+        return self.run.best_policy if self.best else self.run.folder
 
     @classmethod
     def parse(
@@ -55,6 +62,7 @@ class Request:
         engine: str | None = None,
         require: Sequence[str] = (),
         against: Path | None = None,
+        best: bool = False,
     ) -> Request:
         """Reads the arguments of the command line.
 
@@ -72,6 +80,10 @@ class Request:
                 f"--against {against}: a run of {rival.config().environment}; "
                 f"{run} is one of {opened.config().environment}"
             )
+        if best and not opened.best_policy.is_dir():
+            raise UserError(
+                f"--best: {opened.best_policy} is not there; without it the last policy is measured"
+            )
         return cls(
             opened,
             names,
@@ -80,6 +92,7 @@ class Request:
             engine,
             tuple(requirements.parse_requirement(text) for text in require),
             rival,
+            best,
         )
 
 
@@ -131,7 +144,7 @@ def evaluate_run(request: Request, note: Note = lambda text: None) -> Evaluation
 
     config = request.run.config()
     engine = request.engine or request.run.manifest().get("engine", config.engine)
-    policy = load_policy(request.run.folder)
+    policy = load_policy(request.policy)
     env = make_environment(config, engine)
     sets = choose_sets(env, request.sets)
     known = [*(worldset.name for worldset in sets), *([RANGE] if request.ranges else [])]
@@ -201,7 +214,7 @@ def _film(request: Request, evaluation: Evaluation, note: Note) -> Path | None:
     env = make_environment(request.run.config(), evaluation.engine)
     shown = evaluation.sets["train"]
     median = int(np.argsort(shown.episode_return)[len(shown.episode_return) // 2])
-    episode = record(env, load_policy(request.run.folder), shown.draws, median, evaluation.seed)
+    episode = record(env, load_policy(request.policy), shown.draws, median, evaluation.seed)
     try:
         return film(env, episode, request.run.folder / "plots", "train_median")
     except RenderingUnavailable as error:

@@ -52,8 +52,13 @@ class Run:
 
     @property
     def policy(self) -> Path:
-        """The exported policy."""
+        """The exported policy, as it was at the end."""
         return self.folder / "policy"
+
+    @property
+    def best_policy(self) -> Path:
+        """The policy that did best in training."""
+        return self.folder / "best"
 
     @property
     def quarantine(self) -> Path:

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from simreal.learner import Learner, TrainingState
 
 TARGET_EPOCHS = 3
-"""Epochs in a row that must reach `target_success` before training ends early."""
+"""Epochs in a row that must reach `target_success` before training ends early; the best policy is chosen by
+its last as many."""
 
 IDLE_SHARE = 0.01
 """Share of steps waiting for a fresh start that the user is told about."""
@@ -114,7 +115,8 @@ class _Loop:
         self.run = run
         self.stop = stop
         self.progress = progress
-        self.checkpoints = Checkpoints(run.checkpoints, config.checkpoint.keep)
+        kept = config.checkpoint
+        self.checkpoints = Checkpoints(run.checkpoints, kept.keep, kept.keep_every, kept.keep_best)
         self.state: TrainingState = learner.init(config.seed)
         self.recorder = Recorder(
             run.quarantine,
@@ -124,6 +126,7 @@ class _Loop:
             config.rollout.quarantine_files,
         )
         self.rows: list[dict[str, Any]] = []
+        self.best: tuple[float, float] | None = None
         self.saved_step: int | None = None
         self.told_idle = self.told_quarantine = False
 
@@ -149,6 +152,8 @@ class _Loop:
             self.saved_step, self.state = found
             self.checkpoints.discard_after(self.saved_step)
         self.rows = self.run.cut_metrics(self.step)
+        scores = [merit(self.rows[: i + 1]) for i in range(len(self.rows))]
+        self.best = max((score for score in scores if score is not None), default=None)
         manifest.setdefault("resumed", []).append({"step": self.step, **runs.session()})
         self.run.write_manifest(manifest)
         runs.write_text(self.run.config_file, runs.to_yaml(self.config))
@@ -165,16 +170,19 @@ class _Loop:
                 row = self.epoch(began)
                 events.add(row)
                 self.progress.show(row, last=self.step >= self.config.steps)
+                self.note_saved(self.checkpoints.finished())
                 due = time.monotonic() - saved_at >= self.config.checkpoint.every_seconds
                 if due or self.stop.asked:
                     self.save()
                     saved_at = time.monotonic()
                 if self.stop.asked:
+                    self.note_saved(self.checkpoints.finish())
                     raise Interrupted(
                         f"interrupted; step {self.step:,} is saved, --resume --out {self.run.folder} goes on"
                     )
         # Always: a run that was killed between its last checkpoint and the export has an older policy.
         self.save()
+        self.note_saved(self.checkpoints.finish())
         self.progress.say(f"{self._ending()}; {self.run.folder} holds the policy")
 
     def epoch(self, began: float) -> dict[str, Any]:
@@ -183,6 +191,7 @@ class _Loop:
         self.state, values = self.learner.epoch(self.state, self.recorder.watch)
         self.recorder.flush()
         if not _is_finite(self.state):
+            self.note_saved(self.checkpoints.finish())
             raise UserError(
                 f"{self.run.folder}: parameters are no longer finite after step {before:,}; {self.kept()}; "
                 f"a lower learner.learning_rate or learner.max_gradient_norm may help"
@@ -210,17 +219,35 @@ class _Loop:
             )
         self.run.add_metrics(row)
         self.rows.append(row)
+        self.export_if_best()
         return row
 
     def save(self) -> None:
-        """A checkpoint, and the policy as it stands."""
-        self.checkpoints.save(self.step, self.state)
-        self.saved_step = self.step
-        draft = self.run.policy.with_name("policy.unfinished")
+        """Begins a checkpoint, and writes the policy as it stands."""
+        self.note_saved(self.checkpoints.finish())
+        score = merit(self.rows)
+        self.checkpoints.begin_save(self.step, self.state, None if score is None else score[0])
+        self.export(self.run.policy)
+
+    def note_saved(self, step: int | None) -> None:
+        """A checkpoint is on disk."""
+        if step is not None:
+            self.saved_step = step
+
+    def export(self, folder: Path) -> None:
+        """Writes the policy as it stands; a reader meets the old one, none, or all of the new one."""
+        draft = folder.with_name(f"{folder.name}.unfinished")
         shutil.rmtree(draft, ignore_errors=True)
         self.learner.export(self.state).save(draft)
-        shutil.rmtree(self.run.policy, ignore_errors=True)
-        draft.rename(self.run.policy)
+        shutil.rmtree(folder, ignore_errors=True)
+        draft.rename(folder)
+
+    def export_if_best(self) -> None:
+        """Writes the policy beside the last one where it has done better than any before."""
+        score = merit(self.rows)
+        if score is not None and (self.best is None or score > self.best):
+            self.best = score
+            self.export(self.run.best_policy)
 
     def kept(self) -> str:
         """What is left if the run ends here and now."""
@@ -240,6 +267,18 @@ def holds_target(rows: Sequence[Mapping[str, Any]], target: float | None) -> boo
     if target is None or len(last) < TARGET_EPOCHS:
         return False
     return all(rate is not None and rate >= target for rate in last)
+
+
+def merit(rows: Sequence[Mapping[str, Any]]) -> tuple[float, float] | None:
+    """How good the policy is, as far as training tells: success of the mean action, then return, over the
+    last epochs; None where one of them has neither."""
+    last = [(row["success_rate"], row["episode_return"]) for row in rows[-TARGET_EPOCHS:]]
+    if len(last) < TARGET_EPOCHS or any(
+        value is None or math.isnan(value) for pair in last for value in pair
+    ):
+        return None
+    success, episode_return = np.mean(last, axis=0)
+    return float(success), float(episode_return)
 
 
 class _Events:

@@ -51,6 +51,7 @@ class ToyLearner:
         self.env = SimpleNamespace(
             name="toy",
             engine_name="toy",
+            control_dt=0.02,
             randomizer=SimpleNamespace(randomizer=SimpleNamespace(digest="none")),
         )
 
@@ -59,7 +60,7 @@ class ToyLearner:
             {"weights": jnp.zeros((3, 2))}, jnp.ones(2), jax.random.PRNGKey(seed), jnp.zeros((), jnp.uint32)
         )
 
-    def epoch(self, state: ToyState) -> tuple[ToyState, dict[str, float]]:
+    def epoch(self, state: ToyState, watch: Any = None) -> tuple[ToyState, dict[str, float]]:
         time.sleep(self.pause)
         key, noise_key = jax.random.split(state.key)
         weights = state.params["weights"] * 0.9 + jax.random.normal(noise_key, (3, 2))
@@ -73,6 +74,7 @@ class ToyLearner:
             "success_rate": float(steps) / self.config.steps,
             "episodes": 4.0,
             "idle_steps": 0.0,
+            "quarantined": 0.0,
         }
         return ToyState({"weights": weights}, state.normalizer, key, steps), metrics
 
