@@ -7,18 +7,22 @@ JAX is imported only by the commands that compute.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import os
 import sys
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from simreal.errors import UserError
 from simreal.stopping import Interrupted
 
+if TYPE_CHECKING:
+    from simreal.config import RunConfig
+
 DONE, WRONG_INPUT, REQUIREMENT_FAILED, INTERRUPTED = 0, 2, 3, 130
-TRAIN_OPTIONS = ("--out", "--resume", "--from", "--help")
+TRAIN_OPTIONS = ("--out", "--resume", "--from", "--seeds", "--help")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -96,7 +100,7 @@ def _build_train(parser: argparse.ArgumentParser) -> None:
     from simreal.config_keys import config_keys
 
     parser.usage = (
-        "simreal train CONFIG [--key.path VALUE ...] [--out DIR] [--resume] [--from RUN]\n"
+        "simreal train CONFIG [--key.path VALUE ...] [--out DIR] [--seeds N] [--resume] [--from RUN]\n"
         "       simreal train --resume --out DIR"
     )
     parser.add_argument(
@@ -105,6 +109,12 @@ def _build_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder; default: runs/CONFIG-SEED")
     parser.add_argument(
         "--resume", action="store_true", help="go on from the newest checkpoint in the folder"
+    )
+    parser.add_argument(
+        "--seeds",
+        type=int,
+        metavar="N",
+        help="train N seeds, from --seed on, in one program, each into a folder of its own in DIR",
     )
     parser.add_argument(
         "--from", type=Path, metavar="RUN", dest="from_run", help="start from the policy of another run"
@@ -131,10 +141,27 @@ def _train(given: argparse.Namespace) -> int:
     # The resolved file of a run is always called config.yaml, which names nothing.
     name = config.environment if Path(source).name == "config.yaml" else Path(source).stem
     out = given.out or (newest_folder if given.resume else new_folder)(name, config.seed)
+    if given.seeds is not None:
+        return _train_seeds(given, config, out)
     _set_up_jax()
     from simreal.training import train
 
     train(config, out, resume=given.resume, from_run=given.from_run)
+    return DONE
+
+
+def _train_seeds(given: argparse.Namespace, config: RunConfig, out: Path) -> int:
+    """Several seeds of a configuration as one population."""
+    if given.seeds < 1:
+        raise UserError(f"--seeds: must be at least 1, got {given.seeds}")
+    if given.from_run is not None:
+        raise UserError("--seeds and --from exclude each other: a population starts from nothing")
+    seeds = range(config.seed, config.seed + given.seeds)
+    _set_up_jax()
+    from simreal.training import train_population
+
+    configs = [dataclasses.replace(config, seed=seed) for seed in seeds]
+    train_population(configs, [out / f"seed-{seed}" for seed in seeds], out, given.resume)
     return DONE
 
 

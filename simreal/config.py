@@ -36,7 +36,7 @@ Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
 
 @dataclass(frozen=True, config=SETTINGS)
 class NetworkConfig:
-    """Policy and value networks: two multi-layer perceptrons."""
+    """Policy and value networks: two multi-layer perceptrons; the policy's may remember."""
 
     policy_layers: tuple[PositiveInt, ...] = (128, 128)
     """Units of each hidden layer of the policy."""
@@ -48,6 +48,10 @@ class NetworkConfig:
     """Standard deviation of the untrained policy's actions, as a share of half the action range."""
     output_scale: Positive = 0.01
     """Factor on the initial weights of the policy's last layer; small: the first mean action is near 0."""
+    history: PositiveInt = 1
+    """Observations that the policy sees at a time: the newest and those just before it."""
+    recurrent: NonNegativeInt = 0
+    """Units of a recurrent layer (GRU) before the policy's; trained through the time of an unroll."""
 
 
 @dataclass(frozen=True, config=SETTINGS)

@@ -22,9 +22,10 @@ from jax.flatten_util import ravel_pytree
 
 from simreal.brax_parts import losses, optimizer, running_statistics, specs, types
 from simreal.compilation import SideBySide, for_rare_use
-from simreal.config import RunConfig
+from simreal.config import LearnerConfig, RunConfig
 from simreal.environment import Environment
-from simreal.networks import make_networks
+from simreal.memory import Recollection
+from simreal.networks import SEEN, RecurrentNetwork, make_networks
 from simreal.policy import Policy
 from simreal.randomizer import Ranges
 from simreal.rollout import Ended, Flight, Reserve, Rollout, RolloutState
@@ -54,8 +55,39 @@ class TrainingState:
     steps: jax.Array  # () uint32, environment steps learnt from
 
 
-class _Programs(NamedTuple):
-    start: Callable[[np.uint32], TrainingState]
+@struct.dataclass
+class Hyper:
+    """The numbers of `LearnerConfig` that the members of a population may have their own of."""
+
+    learning_rate: Any
+    adaptive_kl: Any
+    min_learning_rate: Any
+    max_learning_rate: Any
+    discount: Any
+    gae_lambda: Any
+    clip: Any
+    clip_value: Any
+    entropy_cost: Any
+    value_cost: Any
+    max_gradient_norm: Any
+    reward_scale: Any
+
+    @classmethod
+    def of(cls, config: LearnerConfig) -> Hyper:
+        """The numbers of one run, which its programs are compiled with."""
+        return cls(**{f.name: getattr(config, f.name) for f in dataclasses.fields(cls)})
+
+    def optimizer(self) -> optax.GradientTransformation:
+        """Adam, after the gradient's norm was clipped."""
+        adam = optax.inject_hyperparams(optax.adam)(learning_rate=self.learning_rate)
+        norm = self.max_gradient_norm
+        return optax.chain(*([] if norm is None else [optax.clip_by_global_norm(norm)]), adam)
+
+
+class Programs(NamedTuple):
+    """What an epoch calls."""
+
+    start: Callable[..., TrainingState]
     refill: Callable[[Reserve, Ranges], Reserve]
     collect: Callable[..., tuple[RolloutState, types.Transition, Ended, Flight]]
     update: Callable[..., tuple[TrainingState, Metrics]]
@@ -74,6 +106,9 @@ class Learner:
         self.config = config
         hyper = config.learner
         builder = env.randomizer
+        self.recollection = Recollection(
+            env.observation_size, config.network.history, config.network.recurrent
+        )
         nominal = None if config.randomization == "train" else (lambda key, ranges: builder.build({}))
         self.worlds = config.worlds
         self.rollout = Rollout(
@@ -83,26 +118,15 @@ class Learner:
             config.rollout.reserve,
             config.rollout.stagger,
             nominal,
+            self.recollection.empty(np),
         )
         state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-        self._observations = {"state": state.obs, "privileged_state": state.privileged}
+        shown = jax.ShapeDtypeStruct((self.recollection.size,), state.obs.dtype)
+        self._observations = {"state": shown, "privileged_state": state.privileged}
         self.networks = make_networks(
-            state.obs.shape[0], state.privileged.shape[0], env.action_size, config.network, hyper
+            shown.shape[0], state.privileged.shape[0], env.action_size, config.network, hyper
         )
-        adam = optax.inject_hyperparams(optax.adam)(learning_rate=hyper.learning_rate)
-        clip = [optax.clip_by_global_norm(hyper.max_gradient_norm)] if hyper.max_gradient_norm else []
-        self.optimizer = optax.chain(*clip, adam)
-        self.loss = functools.partial(
-            losses.compute_ppo_loss,
-            ppo_network=self.networks,
-            entropy_cost=hyper.entropy_cost,
-            discounting=hyper.discount,
-            reward_scaling=hyper.reward_scale,
-            gae_lambda=hyper.gae_lambda,
-            clipping_epsilon=hyper.clip,
-            clipping_epsilon_value=hyper.clip_value,
-            vf_coefficient=hyper.value_cost,
-        )
+        self.hyper = Hyper.of(hyper)
 
     @property
     def steps_per_epoch(self) -> int:
@@ -115,7 +139,7 @@ class Learner:
         return jax.eval_shape(self._start, jax.ShapeDtypeStruct((), jnp.uint32))
 
     @functools.cached_property
-    def _programs(self) -> _Programs:
+    def _programs(self) -> Programs:
         """Compiled at first use, the longest first, each while the next one is traced."""
         state = self.state_shape
         assert isinstance(state.rollout, RolloutState)
@@ -134,13 +158,16 @@ class Learner:
             )
             seed = jax.ShapeDtypeStruct((), jnp.uint32)
             start, _ = compile_(self._start, seed, compiler_options=for_rare_use())
-        return _Programs(start.result(), refill.result(), collect.result(), update.result())
+        return Programs(start.result(), refill.result(), collect.result(), update.result())
 
     def init(self, seed: int) -> TrainingState:
         """The run before its first step."""
         return self._programs.start(np.uint32(seed))
 
-    def _start(self, seed: jax.Array) -> TrainingState:
+    def _start(
+        self, seed: jax.Array, hyper: Hyper | None = None, ranges: Ranges | None = None
+    ) -> TrainingState:
+        hyper = hyper or self.hyper
         key, policy_key, value_key, world_key = jax.random.split(jax.random.PRNGKey(seed), 4)
         params = losses.PPONetworkParams(
             policy=self.networks.policy_network.init(policy_key),
@@ -149,10 +176,10 @@ class Learner:
         sizes = jax.tree.map(lambda o: specs.Array(o.shape, o.dtype), self._observations)
         state = TrainingState(
             params=params,
-            optimizer=self.optimizer.init(ravel_pytree(params)[0]),
+            optimizer=hyper.optimizer().init(ravel_pytree(params)[0]),
             normalizer=running_statistics.init_state(sizes),
             rollout=self.rollout.start(world_key),
-            ranges=self.env.randomizer.ranges,
+            ranges=self.env.randomizer.ranges if ranges is None else ranges,
             last_success=jnp.full(self.config.rollout.greedy_worlds, jnp.nan),
             key=key,
             steps=jnp.zeros((), jnp.uint32),
@@ -164,22 +191,8 @@ class Learner:
         self, state: TrainingState, watch: Watch = lambda steps, before, flight: None
     ) -> tuple[TrainingState, dict[str, float]]:
         """`iterations_per_epoch` times refill, collect and update. The state passed in is used up."""
-        programs, rows = self._programs, []
-        steps = int(state.steps)
-        for _ in range(self.config.learner.iterations_per_epoch):
-            rollout = state.rollout
-            assert isinstance(rollout, RolloutState)  # () only inside `update`
-            reserve = programs.refill(rollout.reserve, state.ranges)
-            before = dataclasses.replace(rollout, reserve=reserve)
-            rollout, data, ended, flight = programs.collect(
-                before, state.params.policy, state.normalizer, state.key
-            )
-            learnt, row = programs.update(dataclasses.replace(state, rollout=()), data, ended)
-            state = dataclasses.replace(learnt, rollout=rollout)
-            rows.append(row)
-            watch(steps, before, flight)
-            steps += self.worlds * self.config.learner.unroll_length
-        return state, _summarise(*jax.device_get((rows, state.last_success)))
+        state, rows = iterate(self._programs, state, self.config, watch)
+        return state, summarise(*jax.device_get((rows, state.last_success)))
 
     # -- collect -------------------------------------------------------------------------------------------
 
@@ -194,8 +207,8 @@ class Learner:
             state: RolloutState, key: jax.Array
         ) -> tuple[RolloutState, tuple[types.Transition, Ended, Flight]]:
             state = self.rollout.renew(state)
-            seen = {"state": state.env.obs, "privileged_state": state.env.privileged}
-            logits = self.networks.policy_network.apply(normalizer, policy, seen)
+            seen, logits, memory = self._look(state, policy, normalizer)
+            state = dataclasses.replace(state, memory=memory)
             raw = distribution.sample_no_postprocessing(logits, key)
             greedy = jnp.arange(self.rollout.worlds)[:, None] >= learning
             action = distribution.postprocess(jnp.where(greedy, distribution.create_dist(logits).mode(), raw))
@@ -221,24 +234,39 @@ class Learner:
 
         keys = jax.random.split(jax.random.fold_in(key, _COLLECT), self.config.learner.unroll_length)
         rollout, (data, ended, flight) = jax.lax.scan(one_step, rollout, keys)
-        final = {"state": rollout.env.obs, "privileged_state": rollout.env.privileged}
+        shown, _ = self.recollection.see(jnp, rollout.memory, rollout.env.obs)
+        final = {"state": shown, "privileged_state": rollout.env.privileged}
         # The loss reads only the last next observation, to bootstrap from.
         data = data._replace(next_observation=jax.tree.map(lambda x: x[None, :learning], final))
         return rollout, data, ended, flight
 
+    def _look(self, state: RolloutState, policy: Any, normalizer: Any) -> tuple[Any, jax.Array, Any]:
+        """What the networks see of all worlds, the policy's logits, and its memory after that."""
+        shown, memory = self.recollection.see(jnp, state.memory, state.env.obs)
+        seen = {"state": shown, "privileged_state": state.env.privileged}
+        network = self.networks.policy_network
+        if not isinstance(network, RecurrentNetwork):
+            return seen, network.apply(normalizer, policy, seen), memory
+        hidden = state.memory["hidden"]
+        logits, after = network.step(normalizer, policy, seen, hidden)
+        seen |= {"hidden": hidden, "fresh": 1 - state.memory["used"]}
+        return seen, logits, memory | {"hidden": after}
+
     # -- update --------------------------------------------------------------------------------------------
 
     def update(
-        self, state: TrainingState, data: types.Transition, ended: Ended
+        self, state: TrainingState, data: types.Transition, ended: Ended, hyper: Hyper | None = None
     ) -> tuple[TrainingState, Metrics]:
         """`epochs` passes of minibatch gradient steps over the data; `state` comes without its rollout."""
+        hyper = hyper or self.hyper
+        adam = hyper.optimizer()
         normalizer = state.normalizer
         # One flat array of all parameters compiles and steps faster than one for each layer.
         weights, as_params = ravel_pytree(state.params)
-        hyper = self.config.learner
+        config = self.config.learner
         old_values = self.networks.value_network.apply(normalizer, state.params.value, data.observation)
         data.extras["policy_extras"]["value"] = old_values
-        observation = data.observation
+        observation = {name: data.observation[name] for name in SEEN}
         # To (B, T, ...): a minibatch is some worlds over the whole unroll, for the advantage estimate.
         data = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data)
 
@@ -249,7 +277,18 @@ class Learner:
             minibatch, key = batch
 
             def loss(weights: jax.Array) -> tuple[jax.Array, Metrics]:
-                return self.loss(as_params(weights), normalizer, minibatch, key)
+                return losses.compute_ppo_loss(
+                    as_params(weights),
+                    *(normalizer, minibatch, key),
+                    ppo_network=self.networks,
+                    entropy_cost=hyper.entropy_cost,
+                    discounting=hyper.discount,
+                    reward_scaling=hyper.reward_scale,
+                    gae_lambda=hyper.gae_lambda,
+                    clipping_epsilon=hyper.clip,
+                    clipping_epsilon_value=hyper.clip_value,
+                    vf_coefficient=hyper.value_cost,
+                )
 
             (_, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(weights)
             rate = jnp.asarray(hyper.learning_rate)
@@ -261,7 +300,7 @@ class Learner:
                     hyper.min_learning_rate,
                     hyper.max_learning_rate,
                 )
-            change, new_optimizer_state = self.optimizer.update(gradient, optimizer_state)
+            change, new_optimizer_state = adam.update(gradient, optimizer_state)
             new_weights = weights + change
             # A gradient that is not finite is skipped and counted: it would be in the parameters for ever.
             fine = jnp.all(jnp.isfinite(gradient))
@@ -277,12 +316,12 @@ class Learner:
             order = jax.random.permutation(order_key, self.worlds)
 
             def split(x: jax.Array) -> jax.Array:
-                return x[order].reshape(hyper.minibatches, -1, *x.shape[1:])
+                return x[order].reshape(config.minibatches, -1, *x.shape[1:])
 
-            keys = jax.random.split(loss_key, hyper.minibatches)
+            keys = jax.random.split(loss_key, config.minibatches)
             return jax.lax.scan(gradient_step, carry, (jax.tree.map(split, data), keys))
 
-        pass_keys = jax.random.split(jax.random.fold_in(state.key, _UPDATE), hyper.epochs)
+        pass_keys = jax.random.split(jax.random.fold_in(state.key, _UPDATE), config.epochs)
         (weights, optimizer_state), metrics = jax.lax.scan(one_pass, (weights, state.optimizer), pass_keys)
         learnt = dataclasses.replace(
             state,
@@ -292,7 +331,7 @@ class Learner:
             normalizer=running_statistics.update(normalizer, observation, std_min_value=_SD_FLOOR),
             last_success=_latest(state.last_success, ended, self.worlds),
             key=jax.random.fold_in(state.key, _NEXT),
-            steps=state.steps + jnp.uint32(self.worlds * hyper.unroll_length),
+            steps=state.steps + jnp.uint32(self.worlds * config.unroll_length),
         )
         row = {name: jnp.mean(metrics[source]) for name, source in _REPORTED.items()}
         row["skipped_updates"] = jnp.sum(metrics["skipped_updates"])
@@ -301,6 +340,26 @@ class Learner:
     def export(self, state: TrainingState) -> Policy:
         """The policy as it would run on a robot: NumPy only."""
         return Policy.from_training(self.env, self.config, state.params.policy, state.normalizer)
+
+
+def iterate(
+    programs: Programs, state: TrainingState, config: RunConfig, watch: Watch
+) -> tuple[TrainingState, list[Metrics]]:
+    """`iterations_per_epoch` times refill, collect and update, of one run or of a population."""
+    rows, steps = [], int(np.asarray(state.steps).flat[0])
+    for _ in range(config.learner.iterations_per_epoch):
+        rollout = state.rollout
+        assert isinstance(rollout, RolloutState)  # () only inside `update`
+        before = dataclasses.replace(rollout, reserve=programs.refill(rollout.reserve, state.ranges))
+        rollout, data, ended, flight = programs.collect(
+            before, state.params.policy, state.normalizer, state.key
+        )
+        learnt, row = programs.update(dataclasses.replace(state, rollout=()), data, ended)
+        state = dataclasses.replace(learnt, rollout=rollout)
+        rows.append(row)
+        watch(steps, before, flight)
+        steps += config.worlds * config.learner.unroll_length
+    return state, rows
 
 
 _REPORTED = {
@@ -313,7 +372,7 @@ _REPORTED = {
 """Name in metrics.jsonl -> name in Brax's loss."""
 
 
-def _summarise(rows: list[dict[str, np.ndarray]], last_success: np.ndarray) -> dict[str, float]:
+def summarise(rows: list[dict[str, np.ndarray]], last_success: np.ndarray) -> dict[str, float]:
     """One row for an epoch: means over its updates, sums and rates over its episodes; NaN where none."""
     total = {name: float(np.sum([row[name] for row in rows])) for name in rows[0]}
     episodes = total.pop("episodes")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from simreal.errors import UserError
+from simreal.memory import Memory, Recollection, gru
 
 ACTIVATIONS: dict[str, Callable[[Any, Any], Any]] = {
     "elu": lambda xp, x: xp.where(x > 0, x, xp.expm1(xp.minimum(x, 0))),
@@ -42,49 +43,66 @@ class PolicyInterface:
     activation: str
     observation_clip: float | None
     """Bound of a normalised observation; None: observations are not normalised."""
+    history: int = 1
+    """Observations that the network sees at a time, the newest first."""
+    hidden: int = 0
+    """Units of the recurrent layer before the others; 0: there is none."""
 
 
 class Policy:
     """Maps observations to actions. Callable as `action, memory = policy(obs, memory, key)`.
 
-    Takes NumPy arrays, or JAX arrays inside a jitted function, with any leading axes; returns the mean
-    action, so `key` is not used. `memory` is `()`: this policy has none.
+    Takes NumPy arrays, or JAX arrays inside a jitted function, with any leading axes, the same for `obs` and
+    `memory`; returns the mean action, so `key` is not used. An episode begins with `initial_state()`, which
+    is `()` for a policy without memory.
     """
 
     def __init__(self, interface: PolicyInterface, weights: Mapping[str, np.ndarray]) -> None:
         self.interface = interface
         self.weights = {name: np.asarray(value) for name, value in weights.items()}
         self.layers = sum(name.startswith("kernel_") for name in self.weights)
+        self.recollection = Recollection(len(interface.observations), interface.history, interface.hidden)
 
-    def initial_state(self) -> tuple:
+    def initial_state(self) -> Memory:
         """The memory at the start of an episode."""
-        return ()
+        return self.recollection.empty(np)
 
-    def __call__(self, obs: Any, memory: Any = (), key: Any = None) -> tuple[Any, Any]:
+    def __call__(self, obs: Any, memory: Memory = (), key: Any = None) -> tuple[Any, Memory]:
         xp: Any = np
         if not isinstance(obs, np.ndarray) and hasattr(obs, "aval"):
             import jax.numpy as xp
-        hidden = obs
+        if not memory and self.recollection.empty(np):
+            raise ValueError("this policy remembers: begin an episode with policy.initial_state()")
+        shown, memory = self.recollection.see(xp, memory, obs)
         if self.interface.observation_clip is not None:
             bound = self.interface.observation_clip
-            hidden = xp.clip((obs - self.weights["mean"]) / self.weights["std"], -bound, bound)
+            shown = xp.clip((shown - self.weights["mean"]) / self.weights["std"], -bound, bound)
+        if self.interface.hidden:
+            memory = memory | {"hidden": gru(xp, self.weights, memory["hidden"], shown)}
+            shown = xp.concatenate([memory["hidden"], shown], axis=-1)
         activate = ACTIVATIONS[self.interface.activation]
         for layer in range(self.layers):
-            hidden = hidden @ self.weights[f"kernel_{layer}"] + self.weights[f"bias_{layer}"]
+            shown = shown @ self.weights[f"kernel_{layer}"] + self.weights[f"bias_{layer}"]
             if layer < self.layers - 1:
-                hidden = activate(xp, hidden)
-        return xp.clip(hidden, -1, 1), memory
+                shown = activate(xp, shown)
+        return xp.clip(shown, -1, 1), memory
 
     @classmethod
     def from_training(cls, env: Any, config: Any, policy_params: Any, normalizer: Any) -> Policy:
         """Takes the policy out of a training state."""
         from simreal.quantities import control_units  # needs MuJoCo, which a robot may not have
 
-        tree = policy_params["params"]
+        head = policy_params["head"] if config.network.recurrent else policy_params
+        tree = head["params"]
         hidden = tree.get("MLP_0", {})
         layers = [hidden[f"hidden_{i}"] for i in range(len(hidden))] + [tree["Dense_0"]]
         weights = {f"kernel_{i}": np.asarray(layer["kernel"]) for i, layer in enumerate(layers)}
         weights |= {f"bias_{i}": np.asarray(layer["bias"]) for i, layer in enumerate(layers)}
+        if config.network.recurrent:
+            cell = policy_params["gru"].items()
+            weights |= {
+                f"gru_{name}_{kind}": np.asarray(w) for name, leaf in cell for kind, w in leaf.items()
+            }
         weights["mean"] = np.asarray(normalizer.mean["state"])
         weights["std"] = np.asarray(normalizer.std["state"])
         zero = np.zeros(env.action_size, np.float32)
@@ -101,6 +119,8 @@ class Policy:
             control_scale=(np.asarray(env.control(zero + 1)) - offset).tolist(),
             activation=config.network.activation,
             observation_clip=learner.observation_clip if learner.normalize_observations else None,
+            history=config.network.history,
+            hidden=config.network.recurrent,
         )
         return cls(interface, weights)
 

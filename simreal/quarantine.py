@@ -102,14 +102,22 @@ class Recorder:
         control_dt: s.
         unroll_length: control steps in an unroll.
         most: files written at most.
+        member: which one of a population to record; leaves then have its axis before the others.
     """
 
     def __init__(
-        self, folder: Path, meta: Mapping[str, Any], control_dt: float, unroll_length: int, most: int
+        self,
+        folder: Path,
+        meta: Mapping[str, Any],
+        control_dt: float,
+        unroll_length: int,
+        most: int,
+        member: int | None = None,
     ) -> None:
         self.folder = folder
         self.meta = dict(meta)
         self.most = most
+        self._own = () if member is None else (member,)
         self.written = len(list(folder.glob("*.npz"))) if folder.is_dir() else 0
         self._steps = math.ceil(SECONDS / control_dt)
         self._unroll_length = unroll_length
@@ -130,7 +138,8 @@ class Recorder:
             return
         self._unread = False
         _, _, flight = self._past[-1]
-        for step, world in np.argwhere(np.asarray(flight.quarantined)):
+        quarantined = np.asarray(flight.quarantined)[self._own]
+        for step, world in np.argwhere(quarantined):
             if self.written < self.most:
                 recording = self._record(int(step), int(world))
                 name = f"{recording.meta['training_step']:010d}-{step:03d}-{world:05d}.npz"
@@ -143,19 +152,22 @@ class Recorder:
         Goes back unroll by unroll, to one that the episode was already in when it began and that is long
         enough ago; or to the start of the episode, which lay in reserve.
         """
-        training_step = self._past[-1][0]
+        training_step, own = self._past[-1][0], self._own
         pieces: list[Flight] = []
         for _, before, flight in reversed(self._past):
-            age, origin = (np.asarray(leaf[: last + 1, world]) for leaf in (flight.age, flight.origin))
+            upto = (*own, slice(last + 1), world)
+            age, origin = (np.asarray(leaf)[upto] for leaf in (flight.age, flight.origin))
             same = (np.diff(age) == 1) & (np.diff(origin) == 0)
             first = last - int(np.argmin(np.append(same[::-1], False)))
-            pieces.insert(0, jax.tree.map(lambda x, a=first, b=last: np.asarray(x[a : b + 1, world]), flight))
-            went_on = int(before.env.steps[world]) == age[0] - 1 and not before.env.done[world]
+            rows, here = (*own, slice(first, last + 1), world), (*own, world)
+            pieces.insert(0, jax.tree.map(lambda leaf, rows=rows: np.asarray(leaf)[rows], flight))
+            went_on = int(before.env.steps[here]) == age[0] - 1 and not before.env.done[here]
             if first or not went_on:
-                begin = jax.tree.map(lambda leaf, i=origin[first]: leaf[i], before.reserve.starts)
+                start = (*own, origin[first])
+                begin = jax.tree.map(lambda leaf, start=start: leaf[start], before.reserve.starts)
                 begin = dataclasses.replace(begin, steps=age[first] - 1)  # staggered ones begin older
                 break
-            begin = jax.tree.map(lambda leaf: leaf[world], before.env)
+            begin = jax.tree.map(lambda leaf, here=here: leaf[here], before.env)
             if sum(len(piece.age) for piece in pieces) >= self._steps:
                 break
             last = self._unroll_length - 1

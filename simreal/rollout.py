@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +50,7 @@ class RolloutState:
     started: jax.Array  # (B,) bool, False until the first reset
     counted: jax.Array  # (B,) bool, False during a staggered first episode, whose length says nothing
     origin: jax.Array  # (B,) int32, place in the reserve that the episode was started from
+    memory: Any  # leaves (B, ...), what a policy remembers of the episode; the rollout only empties it
     reserve: Reserve
 
 
@@ -89,6 +91,7 @@ class Rollout:
         reserve: fresh starts kept ready, rounded up to a multiple of BATCH; default: one for each world.
         stagger: whether first episodes begin at different ages, so that time limits do not come all at once.
         draw_world: (key, ranges) -> World; default: drawn from the randomizer.
+        memory: a policy's memory at the start of an episode, all zeros.
     """
 
     def __init__(
@@ -99,8 +102,10 @@ class Rollout:
         reserve: int | None = None,
         stagger: bool = True,
         draw_world: DrawWorld | None = None,
+        memory: Any = (),
     ) -> None:
         self.env = env
+        self.memory = memory
         self.worlds = worlds
         wanted = capacity or max(4, math.ceil(2 * worlds / env.episode_steps))
         self.capacity = min(worlds, wanted)
@@ -123,6 +128,7 @@ class Rollout:
             started=jnp.zeros(self.worlds, bool),
             counted=jnp.zeros(self.worlds, bool),
             origin=jnp.zeros(self.worlds, jnp.int32),
+            memory=jax.tree.map(lambda leaf: jnp.zeros((self.worlds, *leaf.shape), leaf.dtype), self.memory),
             reserve=Reserve(starts=empty(self.reserve), first=none, left=none, key=key),
         )
 
@@ -182,6 +188,7 @@ class Rollout:
             started=put(state.started, True),
             counted=put(state.counted, counted),
             origin=put(state.origin, places),
+            memory=jax.tree.map(lambda leaf: put(leaf, 0), state.memory),
             reserve=dataclasses.replace(
                 reserve, first=(reserve.first + used) % self.reserve, left=reserve.left - used
             ),

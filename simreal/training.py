@@ -2,38 +2,31 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
-import math
-import shutil
+import functools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from simreal import quiet, registry, runs
-from simreal.checkpoints import Checkpoints
+from simreal import quiet, registry
 from simreal.config import RunConfig
 from simreal.errors import UserError
+from simreal.keeping import Keeper, holds_target
 from simreal.progress import Progress
-from simreal.quarantine import Recorder
-from simreal.resuming import check_config, check_manifest, take_policy
+from simreal.resuming import check_config
 from simreal.runs import Run
 from simreal.stopping import Interrupted, StopRequest
 
 if TYPE_CHECKING:
     from simreal.environment import Environment
     from simreal.learner import Learner, TrainingState
-
-TARGET_EPOCHS = 3
-"""Epochs in a row that must reach `target_success` before training ends early; the best policy is chosen by
-its last as many."""
-
-IDLE_SHARE = 0.01
-"""Share of steps waiting for a fresh start that the user is told about."""
+    from simreal.population import Population
 
 
 def make_environment(config: RunConfig, engine: str | None = None) -> Environment:
@@ -83,243 +76,194 @@ def train(
         raise UserError(
             "--resume and --from exclude each other: one goes on with a run, the other starts one"
         )
-    earlier = Run.open(out) if resume else None
-    if earlier is not None:
-        check_config(earlier.config(), config, out)
+    earlier = _open(config, out) if resume else None
     source = Run.open(from_run) if from_run is not None else None
     learner = build(config)
     run = earlier or Run.create(out, config)
     with StopRequest() as stop, Progress(config.steps) as progress:
-        loop = _Loop(learner, config, run, stop, progress)
-        if earlier is not None:
-            loop.resume()
-        else:
-            loop.start(source)
-        try:
-            loop.run_epochs()
-        except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-                raise
-            raise UserError(f"{out}: {error.strerror}; {loop.kept()}") from error
+        state = learner.init(config.seed)
+        keeper = Keeper(run, config, learner.env, learner.export, progress.say)
+        state = keeper.resume(state) if earlier is not None else keeper.start(state, source)
+        _run(_Alone(learner), state, [keeper], out, stop, progress)
     return out
 
 
-class _Loop:
-    """One call of `train`: the state, the rows so far, and when it was last saved."""
+def train_population(
+    configs: Sequence[RunConfig], folders: Sequence[Path], out: Path, resume: bool = False
+) -> Path:
+    """Trains several runs in one program, each into a folder of its own; see `train`.
 
-    def __init__(
-        self, learner: Learner, config: RunConfig, run: Run, stop: StopRequest, progress: Progress
-    ) -> None:
+    Ends when the steps are done, or when every member holds its `target_success`.
+
+    Args:
+        configs: of the members.
+        folders: of the members.
+        out: the folder above them, for messages.
+        resume: go on from the newest checkpoints that all members have.
+    """
+    quiet.import_mjx()
+    from simreal.population import Population, check_members
+
+    check_members(configs)
+    earlier = [_open(*pair) for pair in zip(configs, folders, strict=True)] if resume else None
+    environments = [make_environment(config) for config in configs]
+    population = Population(environments[0], configs, [env.randomizer.ranges for env in environments])
+    members = earlier or [Run.create(*pair) for pair in zip(folders, configs, strict=True)]
+    with StopRequest() as stop, Progress(configs[0].steps) as progress:
+        together = _Together(population)
+        state = population.init()
+        alone = [together.member(state, i) for i in range(len(configs))]
+        keepers = [
+            Keeper(run, config, env, functools.partial(population.export, index=i), progress.say, i)
+            for i, (run, config, env) in enumerate(zip(members, configs, environments, strict=True))
+        ]
+        if earlier is None:
+            for keeper, own in zip(keepers, alone, strict=True):
+                keeper.start(own, None)
+        else:
+            common = _newest_of_all(keepers)
+            alone = [keeper.resume(own, common) for keeper, own in zip(keepers, alone, strict=True)]
+            state = jax.tree.map(lambda *leaves: jnp.stack(leaves), *alone)
+        _run(together, state, keepers, out, stop, progress)
+    return out
+
+
+class _Trainer(Protocol):
+    """What the loop drives: one run, or several together."""
+
+    name: str
+    engine: str
+
+    def epoch(self, state: Any, keepers: Sequence[Keeper]) -> tuple[Any, list[dict[str, float]]]:
+        """An epoch, and the metrics of each member."""
+
+    def member(self, state: Any, index: int) -> Any:
+        """The state of one member."""
+
+
+class _Alone:
+    """One run."""
+
+    def __init__(self, learner: Learner) -> None:
         self.learner = learner
-        self.config = config
-        self.run = run
-        self.stop = stop
-        self.progress = progress
-        kept = config.checkpoint
-        self.checkpoints = Checkpoints(run.checkpoints, kept.keep, kept.keep_every, kept.keep_best)
-        self.state: TrainingState = learner.init(config.seed)
-        self.recorder = Recorder(
-            run.quarantine,
-            _recording_meta(learner, config),
-            learner.env.control_dt,
-            config.learner.unroll_length,
-            config.rollout.quarantine_files,
-        )
-        self.rows: list[dict[str, Any]] = []
-        self.best: tuple[float, float] | None = None
-        self.saved_step: int | None = None
-        self.told_idle = self.told_quarantine = False
+        self.name, self.engine = learner.env.name, learner.env.engine_name
 
-    @property
-    def step(self) -> int:
-        """Environment steps so far."""
-        return int(self.state.steps)
+    def epoch(self, state: Any, keepers: Sequence[Keeper]) -> tuple[Any, list[dict[str, float]]]:
+        state, values = self.learner.epoch(state, keepers[0].recorder.watch)
+        return state, [values]
 
-    def start(self, source: Run | None) -> None:
-        """A new run, from nothing or from another run's policy."""
-        manifest = _manifest(self.learner, self.config)
-        if source is not None:
-            step, self.state = take_policy(self.state, source, self.progress.say)
-            manifest["from"] = {"run": str(source.folder), "step": step}
-        self.run.write_manifest(manifest)
+    def member(self, state: Any, index: int) -> Any:
+        return state
 
-    def resume(self) -> None:
-        """Goes on from the newest sound checkpoint, or from the start where none was saved yet."""
-        manifest = self.run.manifest() or _manifest(self.learner, self.config)
-        check_manifest(manifest, _manifest(self.learner, self.config), self.run.folder, self.progress.say)
-        found = self.checkpoints.restore(self.state, self.progress.say)
-        if found is not None:
-            self.saved_step, self.state = found
-            self.checkpoints.discard_after(self.saved_step)
-        self.rows = self.run.cut_metrics(self.step)
-        scores = [merit(self.rows[: i + 1]) for i in range(len(self.rows))]
-        self.best = max((score for score in scores if score is not None), default=None)
-        manifest.setdefault("resumed", []).append({"step": self.step, **runs.session()})
-        self.run.write_manifest(manifest)
-        runs.write_text(self.run.config_file, runs.to_yaml(self.config))
-        self.progress.say(f"going on with {self.run.folder} at step {self.step:,}")
 
-    def run_epochs(self) -> None:
-        """Until the steps are done or the target is held; raises Interrupted where it is asked to stop."""
-        began = time.monotonic() - (self.rows[-1]["wall_seconds"] if self.rows else 0.0)
-        saved_at = time.monotonic()
-        env = self.learner.env
-        self.progress.say(f"training {env.name} on {env.engine_name} into {self.run.folder}; compiling first")
-        with _Events(self.run, self.step) as events:
-            while self.step < self.config.steps and not holds_target(self.rows, self.config.target_success):
-                row = self.epoch(began)
-                events.add(row)
-                self.progress.show(row, last=self.step >= self.config.steps)
-                self.note_saved(self.checkpoints.finished())
-                due = time.monotonic() - saved_at >= self.config.checkpoint.every_seconds
-                if due or self.stop.asked:
-                    self.save()
-                    saved_at = time.monotonic()
-                if self.stop.asked:
-                    self.note_saved(self.checkpoints.finish())
-                    raise Interrupted(
-                        f"interrupted; step {self.step:,} is saved, --resume --out {self.run.folder} goes on"
-                    )
+class _Together:
+    """Several runs in one program."""
+
+    def __init__(self, population: Population) -> None:
+        self.population = population
+        env = population.env
+        self.name, self.engine = f"{population.members} x {env.name}", env.engine_name
+        self._copied: tuple[Any, Any] = (None, None)
+
+    def epoch(self, state: Any, keepers: Sequence[Keeper]) -> tuple[Any, list[dict[str, float]]]:
+        self._copied = (None, None)
+
+        def watch(*seen: Any) -> None:
+            for keeper in keepers:
+                keeper.recorder.watch(*seen)
+
+        return self.population.epoch(state, watch)
+
+    def member(self, state: TrainingState, index: int) -> TrainingState:
+        if self._copied[0] is not state:  # one copy to the host for all members
+            self._copied = (state, jax.device_get(state))
+        return jax.tree.map(lambda leaf: np.asarray(leaf[index]), self._copied[1])
+
+
+def _run(
+    trainer: _Trainer, state: Any, keepers: Sequence[Keeper], out: Path, stop: StopRequest, progress: Progress
+) -> None:
+    """Epochs until the steps are done or the target is held; raises Interrupted where it is asked to stop."""
+    config = keepers[0].config
+    step = int(trainer.member(state, 0).steps)
+    began = time.monotonic() - keepers[0].seconds
+    saved_at = time.monotonic()
+    progress.say(f"training {trainer.name} on {trainer.engine} into {out}; compiling first")
+
+    def save() -> None:
+        for i, keeper in enumerate(keepers):
+            keeper.save(trainer.member(state, i))
+
+    with _told(out, keepers[0]), _closing(keepers, step):
+        while step < config.steps and not all(
+            holds_target(keeper.rows, keeper.config.target_success) for keeper in keepers
+        ):
+            start, before = time.monotonic(), step
+            state, values = trainer.epoch(state, keepers)
+            now = time.monotonic()
+            times = (before, now - start, now - began)
+            rows = [
+                keeper.record(trainer.member(state, i), values[i], *times) for i, keeper in enumerate(keepers)
+            ]
+            step = rows[0]["step"]
+            progress.show(_overview(rows), last=step >= config.steps)
+            if stop.asked or time.monotonic() - saved_at >= config.checkpoint.every_seconds:
+                save()
+                saved_at = time.monotonic()
+            if stop.asked:
+                for keeper in keepers:
+                    keeper.note_saved(wait=True)
+                raise Interrupted(
+                    f"interrupted; step {step:,} is saved, the same command with --resume --out {out} goes on"
+                )
         # Always: a run that was killed between its last checkpoint and the export has an older policy.
-        self.save()
-        self.note_saved(self.checkpoints.finish())
-        self.progress.say(f"{self._ending()}; {self.run.folder} holds the policy")
-
-    def epoch(self, began: float) -> dict[str, Any]:
-        """One epoch and its row in metrics.jsonl."""
-        start, before = time.monotonic(), self.step
-        self.state, values = self.learner.epoch(self.state, self.recorder.watch)
-        self.recorder.flush()
-        if not _is_finite(self.state):
-            self.note_saved(self.checkpoints.finish())
-            raise UserError(
-                f"{self.run.folder}: parameters are no longer finite after step {before:,}; {self.kept()}; "
-                f"a lower learner.learning_rate or learner.max_gradient_norm may help"
-            )
-        now = time.monotonic()
-        row = {
-            "step": self.step,
-            "episode_return": values.pop("episode_return"),
-            "success_rate": values.pop("success_rate"),
-            "steps_per_second": (self.step - before) / (now - start),
-            "wall_seconds": now - began,
-            **values,
-        }
-        if values["quarantined"] and not self.told_quarantine:
-            self.told_quarantine = True
-            self.progress.say(
-                f"a world's physics blew up; its episode is over and counts for nothing. Such worlds lie in "
-                f"{self.run.quarantine}; 'simreal replay FILE' shows one again"
-            )
-        if values["idle_steps"] > IDLE_SHARE * (self.step - before) and not self.told_idle:
-            self.told_idle = True
-            self.progress.say(
-                f"{values['idle_steps'] / (self.step - before):.0%} of the steps waited for a fresh start, "
-                "because more episodes ended in an unroll than rollout.reserve holds; a larger one avoids it"
-            )
-        self.run.add_metrics(row)
-        self.rows.append(row)
-        self.export_if_best()
-        return row
-
-    def save(self) -> None:
-        """Begins a checkpoint, and writes the policy as it stands."""
-        self.note_saved(self.checkpoints.finish())
-        score = merit(self.rows)
-        self.checkpoints.begin_save(self.step, self.state, None if score is None else score[0])
-        self.export(self.run.policy)
-
-    def note_saved(self, step: int | None) -> None:
-        """A checkpoint is on disk."""
-        if step is not None:
-            self.saved_step = step
-
-    def export(self, folder: Path) -> None:
-        """Writes the policy as it stands; a reader meets the old one, none, or all of the new one."""
-        draft = folder.with_name(f"{folder.name}.unfinished")
-        shutil.rmtree(draft, ignore_errors=True)
-        self.learner.export(self.state).save(draft)
-        shutil.rmtree(folder, ignore_errors=True)
-        draft.rename(folder)
-
-    def export_if_best(self) -> None:
-        """Writes the policy beside the last one where it has done better than any before."""
-        score = merit(self.rows)
-        if score is not None and (self.best is None or score > self.best):
-            self.best = score
-            self.export(self.run.best_policy)
-
-    def kept(self) -> str:
-        """What is left if the run ends here and now."""
-        if self.saved_step is None:
-            return "no checkpoint was saved yet"
-        return f"the checkpoint at step {self.saved_step:,} is intact"
-
-    def _ending(self) -> str:
-        if self.step >= self.config.steps:
-            return f"{self.step:,} steps done"
-        return f"success held {self.config.target_success:.0%} at step {self.step:,}"
+        save()
+    done = f"{step:,} steps done"
+    if step < config.steps:
+        done = f"success held {config.target_success:.0%} at step {step:,}"
+    holds = "holds the policy" if len(keepers) == 1 else f"holds {len(keepers)} runs"
+    progress.say(f"{done}; {out} {holds}")
 
 
-def holds_target(rows: Sequence[Mapping[str, Any]], target: float | None) -> bool:
-    """Whether the success rate of the mean action reached `target` in each of the last epochs."""
-    last = [row["success_rate"] for row in rows[-TARGET_EPOCHS:]]
-    if target is None or len(last) < TARGET_EPOCHS:
-        return False
-    return all(rate is not None and rate >= target for rate in last)
+@contextlib.contextmanager
+def _closing(keepers: Sequence[Keeper], step: int) -> Iterator[None]:
+    """Opens what the keepers write to, and closes it in the end."""
+    for keeper in keepers:
+        keeper.open_events(step)
+    try:
+        yield
+    finally:
+        for keeper in keepers:
+            keeper.close()
 
 
-def merit(rows: Sequence[Mapping[str, Any]]) -> tuple[float, float] | None:
-    """How good the policy is, as far as training tells: success of the mean action, then return, over the
-    last epochs; None where one of them has neither."""
-    last = [(row["success_rate"], row["episode_return"]) for row in rows[-TARGET_EPOCHS:]]
-    if len(last) < TARGET_EPOCHS or any(
-        value is None or math.isnan(value) for pair in last for value in pair
-    ):
-        return None
-    success, episode_return = np.mean(last, axis=0)
-    return float(success), float(episode_return)
+@contextlib.contextmanager
+def _told(out: Path, keeper: Keeper) -> Iterator[None]:
+    """Turns a full disk into one line."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise UserError(f"{out}: {error.strerror}; {keeper.kept()}") from error
 
 
-class _Events:
-    """TensorBoard events of the metrics; a resumed run replaces what it computes again."""
-
-    def __init__(self, run: Run, step: int) -> None:
-        from tensorboardX import SummaryWriter
-
-        self.writer = SummaryWriter(str(run.events), purge_step=step + 1 if step else None)
-
-    def __enter__(self) -> _Events:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.writer.close()
-
-    def add(self, row: Mapping[str, Any]) -> None:
-        """One row, under the names that metrics.jsonl has."""
-        for name, value in row.items():
-            if name != "step" and math.isfinite(value):
-                self.writer.add_scalar(name, value, row["step"])
+def _overview(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One row for the progress line: means over the members."""
+    if len(rows) == 1:
+        return rows[0]
+    mean = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    return mean | {"step": rows[0]["step"], "quarantined": sum(row["quarantined"] for row in rows)}
 
 
-def _recording_meta(learner: Learner, config: RunConfig) -> dict[str, Any]:
-    """What every recording of a blown world says of its run."""
-    return {
-        "environment": config.environment,
-        "engine": learner.env.engine_name,
-        "seed": config.seed,
-        "randomizer": learner.env.randomizer.randomizer.digest,
-        "config": config.to_dict(),
-    }
+def _open(config: RunConfig, folder: Path) -> Run:
+    """A run that is to be resumed with this configuration."""
+    run = Run.open(folder)
+    check_config(run.config(), config, folder)
+    return run
 
 
-def _manifest(learner: Learner, config: RunConfig) -> dict[str, Any]:
-    return runs.describe(config, learner.env.engine_name, learner.env.randomizer.randomizer.digest)
-
-
-def _is_finite(state: TrainingState) -> bool:
-    """Whether the networks and the normaliser may be saved."""
-    leaves = jax.device_get(jax.tree.leaves((state.params, state.normalizer)))
-    return all(np.isfinite(leaf).all() for leaf in leaves)
+def _newest_of_all(keepers: Sequence[Keeper]) -> int:
+    """The newest step at which every member has a checkpoint; 0 where there is none."""
+    common = set.intersection(*(set(keeper.checkpoints.steps()) for keeper in keepers))
+    return max(common, default=0)

@@ -16,8 +16,9 @@ import pytest
 from simreal.checkpoints import Checkpoints
 from simreal.config import CheckpointConfig, RunConfig
 from simreal.errors import UserError
+from simreal.keeping import holds_target
 from simreal.runs import Run
-from simreal.training import holds_target, train
+from simreal.training import train
 from tests.toy_learner import STEPS_PER_EPOCH, ToyLearner
 
 TOY = Path(__file__).parent / "toy_learner.py"
