@@ -72,6 +72,9 @@ class LearnerConfig:
     """Lowest rate that the steering may reach."""
     max_learning_rate: Positive = 2e-3
     """Highest rate that the steering may reach."""
+    decay_steps: PositiveInt | None = None
+    """Environment steps over which the rate, or the highest that the steering may reach, falls linearly to
+    `min_learning_rate`; null: it does not fall."""
     discount: Fraction = 0.99
     """Weight of a reward one control step later."""
     gae_lambda: Fraction = 0.95

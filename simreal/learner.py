@@ -63,6 +63,7 @@ class Hyper:
     adaptive_kl: Any
     min_learning_rate: Any
     max_learning_rate: Any
+    decay_steps: Any
     discount: Any
     gae_lambda: Any
     clip: Any
@@ -76,6 +77,14 @@ class Hyper:
     def of(cls, config: LearnerConfig) -> Hyper:
         """The numbers of one run, which its programs are compiled with."""
         return cls(**{f.name: getattr(config, f.name) for f in dataclasses.fields(cls)})
+
+    def highest_rate(self, steps: jax.Array) -> tuple[Any, Any]:
+        """The learning rate without steering, and the highest with it, after as many environment steps."""
+        if self.decay_steps is None:
+            return self.learning_rate, self.max_learning_rate
+        left = jnp.maximum(0.0, 1.0 - steps / self.decay_steps)
+        lowest = self.min_learning_rate
+        return tuple(lowest + left * (rate - lowest) for rate in (self.learning_rate, self.max_learning_rate))
 
     def optimizer(self) -> optax.GradientTransformation:
         """Adam, after the gradient's norm was clipped."""
@@ -260,6 +269,7 @@ class Learner:
         """`epochs` passes of minibatch gradient steps over the data; `state` comes without its rollout."""
         hyper = hyper or self.hyper
         adam = hyper.optimizer()
+        usual_rate, highest_rate = hyper.highest_rate(state.steps)
         normalizer = state.normalizer
         # One flat array of all parameters compiles and steps faster than one for each layer.
         weights, as_params = ravel_pytree(state.params)
@@ -291,15 +301,17 @@ class Learner:
                 )
 
             (_, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(weights)
-            rate = jnp.asarray(hyper.learning_rate)
+            rate = jnp.asarray(usual_rate, weights.dtype)
             if hyper.adaptive_kl is not None:
                 optimizer_state, rate = optimizer.adaptive_kl_learning_rate(
                     optimizer_state,
                     metrics["kl_mean"],
                     hyper.adaptive_kl,
                     hyper.min_learning_rate,
-                    hyper.max_learning_rate,
+                    highest_rate,
                 )
+                rate = jnp.minimum(rate, highest_rate)
+            optimizer_state[-1].hyperparams["learning_rate"] = rate
             change, new_optimizer_state = adam.update(gradient, optimizer_state)
             new_weights = weights + change
             # A gradient that is not finite is skipped and counted: it would be in the parameters for ever.
