@@ -15,6 +15,7 @@ from simreal import runs
 from simreal.checkpoints import Checkpoints
 from simreal.config import RunConfig
 from simreal.errors import UserError
+from simreal.live import LivePage
 from simreal.quarantine import Recorder
 from simreal.resuming import check_manifest, take_policy
 from simreal.runs import Run
@@ -74,6 +75,8 @@ class Keeper:
         self.best: tuple[float, float] | None = None
         self.saved_step: int | None = None
         self._events: Any = None
+        title = f"{config.environment}, seed {config.seed}, on {env.engine_name}"
+        self._page = LivePage(run.report, title, config.steps)
         self._told_idle = self._told_quarantine = False
 
     # -- the beginning and the end -------------------------------------------------------------------------
@@ -119,7 +122,8 @@ class Keeper:
         self._events = SummaryWriter(str(self.run.events), purge_step=step + 1 if step else None)
 
     def close(self) -> None:
-        """Ends the events, and waits for the checkpoint that is being written."""
+        """Ends the events and the page, and waits for the checkpoint that is being written."""
+        self._page.show(self.rows, done=True)
         if self._events is not None:
             self._events.close()
         self.note_saved(wait=True)
@@ -163,6 +167,7 @@ class Keeper:
         for name, value in row.items():
             if name != "step" and math.isfinite(value):
                 self._events.add_scalar(name, value, step)
+        self._page.show(self.rows)
         score = merit(self.rows)
         if score is not None and (self.best is None or score > self.best):
             self.best = score

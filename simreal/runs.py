@@ -61,6 +61,11 @@ class Run:
         return self.folder / "best"
 
     @property
+    def report(self) -> Path:
+        """The page to look at: curves while it trains, everything after an evaluation."""
+        return self.folder / "report.html"
+
+    @property
     def quarantine(self) -> Path:
         """A file for each world that blew up."""
         return self.folder / "quarantine"
