@@ -222,7 +222,7 @@ def run_brax(plan: Plan, seed: int, record: Record) -> None:
         batch_size=config.worlds // hyper.minibatches,
         num_minibatches=hyper.minibatches,
         num_updates_per_batch=hyper.epochs,
-        learning_rate=hyper.learning_rate,
+        learning_rate=_rate(config),
         learning_rate_schedule=None if hyper.adaptive_kl is None else "ADAPTIVE_KL",
         desired_kl=hyper.adaptive_kl or 0.0,
         learning_rate_schedule_min_lr=hyper.min_learning_rate,
@@ -245,6 +245,33 @@ def run_brax(plan: Plan, seed: int, record: Record) -> None:
         progress_fn=progress,
         max_devices_per_host=1,
     )
+
+
+class FallingRate:
+    """A learning rate that falls linearly, for Brax: optax calls it, `ppo.train` reports it as an array."""
+
+    def __init__(self, first: float, last: float, updates: float) -> None:
+        self.first, self.last, self.updates = first, last, updates
+
+    def __call__(self, count):
+        import jax.numpy as jnp
+
+        return self.last + (self.first - self.last) * jnp.maximum(0.0, 1.0 - count / self.updates)
+
+    def __jax_array__(self):
+        import jax.numpy as jnp
+
+        return jnp.asarray(self.first)
+
+
+def _rate(config) -> float | FallingRate:
+    """The learning rate that Brax gets: simreal's, which falls from update to update not step to step."""
+    hyper = config.learner
+    if hyper.decay_steps is None:
+        return hyper.learning_rate
+    assert hyper.adaptive_kl is None, "Brax cannot steer a rate that falls"
+    updates = hyper.decay_steps / (config.worlds * hyper.unroll_length) * hyper.epochs * hyper.minibatches
+    return FallingRate(hyper.learning_rate, hyper.min_learning_rate, updates)
 
 
 def run_side(side: str, plan: Plan, seed: int, began: float, file: Path) -> None:

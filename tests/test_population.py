@@ -93,7 +93,7 @@ def test_what_is_compiled_in_may_not_differ():
     with pytest.raises(UserError, match="may not differ in worlds"):
         check_members([config(0), config(1, worlds=32)])
     with pytest.raises(UserError, match=r"may not differ in learner\.adaptive_kl"):
-        check_members([config(0), config(0, **{"learner.adaptive_kl": None})])
+        check_members([config(0), config(0, **{"learner.adaptive_kl": 0.01})])
 
 
 @pytest.mark.slow
