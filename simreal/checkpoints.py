@@ -14,6 +14,7 @@ import logging
 import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
+from concurrent import futures
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
@@ -34,6 +35,10 @@ pages of traces, so that is seen before."""
 SPARE = 2_000_000
 
 
+_WRITER = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
+"""Writes the checkpoints of all runs of this process, one after the other."""
+
+
 class Checkpoints:
     """The checkpoints of one run.
 
@@ -51,7 +56,6 @@ class Checkpoints:
         self.keep = keep
         self.keep_every = keep_every
         self.keep_best = keep_best
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
         self._saving: Future[int] | None = None
 
     def steps(self) -> list[int]:
@@ -68,7 +72,7 @@ class Checkpoints:
         """
         self.finish()
         leaves = {name: np.array(leaf) for name, leaf in flatten(state).items()}
-        self._saving = self._pool.submit(self._save, step, leaves, score)
+        self._saving = _WRITER.submit(self._save, step, leaves, score)
 
     def finished(self, wait: bool = False) -> int | None:
         """The step of the save in the background, once, as soon as it is done.
@@ -78,6 +82,7 @@ class Checkpoints:
         """
         if self._saving is None or not (wait or self._saving.done()):
             return None
+        futures.wait([self._saving])  # before it is forgotten: this may be interrupted
         saving, self._saving = self._saving, None
         return saving.result()
 
@@ -105,6 +110,8 @@ class Checkpoints:
         leaves = {name: leaf for name, leaf in state.items() if leaf.size}
         final = self.folder / str(step)
         draft = self.folder / f"{step}.unfinished"
+        if final.exists() and _flaw(final) is None and _score(final) == score:
+            return step  # the same step of the same run is the same state, bit for bit
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             for left_over in self.folder.glob("*.unfinished*"):
@@ -115,8 +122,9 @@ class Checkpoints:
             (draft / SCORE).write_text(json.dumps(score), encoding="utf-8")
             (draft / SEAL).write_text(json.dumps(_digests(draft), indent=1), encoding="utf-8")
             if final.exists():  # a damaged one that resuming passed over
-                shutil.rmtree(final)
+                final.rename(self.folder / f"{step}.unfinished.old")
             draft.rename(final)
+            shutil.rmtree(self.folder / f"{step}.unfinished.old", ignore_errors=True)
             self._thin_out()
         except (OSError, ValueError) as error:
             shutil.rmtree(draft, ignore_errors=True)
@@ -150,8 +158,12 @@ class Checkpoints:
         known = {step: score for step, score in scores.items() if score is not None}
         return max(known, key=lambda step: (known[step], step), default=None)
 
+    def sound_steps(self) -> list[int]:
+        """Steps of the checkpoints whose files are as they were written, oldest first."""
+        return [step for step in self.steps() if _flaw(self.folder / str(step)) is None]
+
     def restore(
-        self, like: Tree, say: Callable[[str], None], partial: bool = False
+        self, like: Tree, say: Callable[[str], None], partial: bool = False, newest: int | None = None
     ) -> tuple[int, Tree] | None:
         """The newest sound checkpoint.
 
@@ -159,6 +171,7 @@ class Checkpoints:
             like: a state of the same structure, such as a fresh one; its values do not matter.
             say: called with one line for each damaged checkpoint that is passed over.
             partial: whether `like` may lack some of what was saved.
+            newest: no checkpoint after this step.
 
         Returns:
             Step and state, or None where nothing was ever saved.
@@ -167,6 +180,8 @@ class Checkpoints:
             UserError: there are checkpoints but none is sound, or it belongs to another configuration.
         """
         for step in reversed(self.steps()):
+            if newest is not None and step > newest:
+                continue
             flaw = _flaw(self.folder / str(step))
             if flaw is None:
                 return step, unflatten(like, self._read(step), f"{self.folder / str(step)}", partial)

@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"simreal: {interruption}", file=sys.stderr)
         return INTERRUPTED
     except KeyboardInterrupt:
-        print("simreal: interrupted before anything was saved in this call", file=sys.stderr)
+        print("simreal: interrupted at once; what was saved before is intact", file=sys.stderr)
         return INTERRUPTED
     except PermissionError as error:
         print(f"simreal: {error.filename}: {error.strerror}", file=sys.stderr)
@@ -131,6 +131,8 @@ def _train(given: argparse.Namespace) -> int:
     from simreal.runs import Run, new_folder, newest_folder
 
     source = given.config
+    if source is None and given.seeds is not None:
+        raise UserError("train: --seeds needs CONFIG, with --resume too")
     if source is None and given.resume and given.out is not None:
         source = Run.open(given.out).config_file
     if source is None:
@@ -152,8 +154,8 @@ def _train(given: argparse.Namespace) -> int:
 
 def _train_seeds(given: argparse.Namespace, config: RunConfig, out: Path) -> int:
     """Several seeds of a configuration as one population."""
-    if given.seeds < 1:
-        raise UserError(f"--seeds: must be at least 1, got {given.seeds}")
+    if not 1 <= given.seeds <= 2**32 - config.seed:
+        raise UserError(f"--seeds: must be at least 1, and the last seed below 2**32, got {given.seeds}")
     if given.from_run is not None:
         raise UserError("--seeds and --from exclude each other: a population starts from nothing")
     seeds = range(config.seed, config.seed + given.seeds)
@@ -188,7 +190,10 @@ def _build_evaluate(parser: argparse.ArgumentParser) -> None:
         help="exit with 3 unless it holds, as in 'held_out.success>=0.9'; may be repeated",
     )
     parser.add_argument(
-        "--against", type=Path, metavar="RUN", help="compare with this run on the same worlds, in the report"
+        "--against",
+        type=Path,
+        metavar="RUN",
+        help="compare with this run (its last policy) on the same worlds, in the report",
     )
     parser.add_argument(
         "--best", action="store_true", help="the policy that did best in training instead of the last one"

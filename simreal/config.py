@@ -72,7 +72,7 @@ class LearnerConfig:
     """Lowest rate that the steering may reach."""
     max_learning_rate: Positive = 2e-3
     """Highest rate that the steering may reach."""
-    decay_steps: PositiveInt | None = None
+    decay_steps: Annotated[int, Field(gt=0, lt=2**32)] | None = None
     """Environment steps over which the rate, or the highest that the steering may reach, falls linearly to
     `min_learning_rate`; null: it does not fall."""
     discount: Fraction = 0.99
@@ -104,6 +104,11 @@ class LearnerConfig:
             raise ValueError(
                 f"min_learning_rate {self.min_learning_rate:g} is above "
                 f"max_learning_rate {self.max_learning_rate:g}"
+            )
+        if self.decay_steps is not None and self.min_learning_rate > self.learning_rate:
+            raise ValueError(
+                f"min_learning_rate {self.min_learning_rate:g}, to which the rate falls, is above "
+                f"learning_rate {self.learning_rate:g}"
             )
         return self
 

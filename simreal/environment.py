@@ -307,7 +307,7 @@ class Environment(abc.ABC):
     def _reset(self, key: jax.Array, world: World | None, ranges: Ranges | None) -> State:
         key, world_key, start_key, actuator_key, sensor_key = jax.random.split(key, 5)
         if world is None:
-            world = self.randomizer.build(self.randomizer.sample(world_key, ranges))
+            world = self.randomizer.build(self.randomizer.sample(world_key, ranges), ranges)
         qpos, qvel, task = self.start(start_key)
         physics = self.engine.initial(qpos, qvel)
         now = world.at(physics.time)

@@ -14,7 +14,6 @@ import numpy as np
 from simreal import runs
 from simreal.checkpoints import Checkpoints
 from simreal.config import RunConfig
-from simreal.errors import UserError
 from simreal.live import LivePage
 from simreal.quarantine import Recorder
 from simreal.resuming import check_manifest, take_policy
@@ -77,7 +76,7 @@ class Keeper:
         self._events: Any = None
         title = f"{config.environment}, seed {config.seed}, on {env.engine_name}"
         self._page = LivePage(run.report, title, config.steps)
-        self._told_idle = self._told_quarantine = False
+        self._recorded = self._told_idle = self._told_quarantine = False
 
     # -- the beginning and the end -------------------------------------------------------------------------
 
@@ -94,16 +93,15 @@ class Keeper:
         """The state of the newest sound checkpoint (up to step `newest`), or `state` where there is none."""
         manifest = self.run.manifest() or self._manifest()
         check_manifest(manifest, self._manifest(), self.run.folder, self.say)
-        if newest is not None:
-            self.checkpoints.discard_after(newest)
-        found = self.checkpoints.restore(state, self.say)
+        found = self.checkpoints.restore(state, self.say, newest=newest)
         if found is not None:
             self.saved_step, state = found
             self.checkpoints.discard_after(self.saved_step)
         step = self.saved_step or 0
         self.rows = self.run.cut_metrics(step)
-        scores = [merit(self.rows[: i + 1]) for i in range(len(self.rows))]
-        self.best = max((score for score in scores if score is not None), default=None)
+        if self.run.best_policy.is_dir():
+            scores = [merit(self.rows[max(0, i - RECENT_EPOCHS) : i]) for i in range(1, len(self.rows) + 1)]
+            self.best = max((score for score in scores if score is not None), default=None)
         manifest.setdefault("resumed", []).append({"step": step, **runs.session()})
         self.run.write_manifest(manifest)
         runs.write_text(self.run.config_file, runs.to_yaml(self.config))
@@ -122,11 +120,14 @@ class Keeper:
         self._events = SummaryWriter(str(self.run.events), purge_step=step + 1 if step else None)
 
     def close(self) -> None:
-        """Ends the events and the page, and waits for the checkpoint that is being written."""
-        self._page.show(self.rows, done=True)
-        if self._events is not None:
-            self._events.close()
-        self.note_saved(wait=True)
+        """Waits for the checkpoint that is being written, and ends the events and the page."""
+        try:
+            self.note_saved(wait=True)
+        finally:
+            if self._events is not None:
+                self._events.close()
+            if self._recorded:  # else there may be the full report of a run that was finished before
+                self._page.show(self.rows, done=True)
 
     # -- an epoch ------------------------------------------------------------------------------------------
 
@@ -141,17 +142,8 @@ class Keeper:
             before: steps before the epoch.
             took: seconds that the epoch took.
             wall: seconds of the run, this epoch included.
-
-        Raises:
-            UserError: the parameters are no longer finite.
         """
         self.recorder.flush()
-        if not _is_finite(state):
-            self.note_saved(wait=True)
-            raise UserError(
-                f"{self.run.folder}: parameters are no longer finite after step {before:,}; {self.kept()}; "
-                f"a lower learner.learning_rate or learner.max_gradient_norm may help"
-            )
         step, values = int(state.steps), dict(values)
         row = {
             "step": step,
@@ -164,6 +156,7 @@ class Keeper:
         self._tell(values, step - before)
         self.run.add_metrics(row)
         self.rows.append(row)
+        self._recorded = True
         for name, value in row.items():
             if name != "step" and math.isfinite(value):
                 self._events.add_scalar(name, value, step)
@@ -178,9 +171,10 @@ class Keeper:
     def _tell(self, values: Mapping[str, float], steps: int) -> None:
         if values["quarantined"] and not self._told_quarantine:
             self._told_quarantine = True
+            kept = f"; such worlds lie in {self.run.quarantine}, and 'simreal replay FILE' shows one again"
             self.say(
-                f"a world's physics blew up; its episode is over and counts for nothing. Such worlds lie in "
-                f"{self.run.quarantine}; 'simreal replay FILE' shows one again"
+                "a world's physics blew up: its episode is over and counts for nothing"
+                f"{kept if self.recorder.most else ''}"
             )
         if values["idle_steps"] > IDLE_SHARE * steps and not self._told_idle:
             self._told_idle = True
@@ -245,7 +239,7 @@ def holds_target(rows: Sequence[Mapping[str, Any]], target: float | None) -> boo
 
 def merit(rows: Sequence[Mapping[str, Any]]) -> tuple[float, float] | None:
     """How good the policy is, as far as training tells: success of the mean action, then return, over the
-    last epochs; None where one of them has neither."""
+    last epochs; None where one of these is not known, as without greedy worlds."""
     last = [(row["success_rate"], row["episode_return"]) for row in rows[-RECENT_EPOCHS:]]
     if len(last) < RECENT_EPOCHS or any(
         value is None or math.isnan(value) for pair in last for value in pair
@@ -255,7 +249,7 @@ def merit(rows: Sequence[Mapping[str, Any]]) -> tuple[float, float] | None:
     return float(success), float(episode_return)
 
 
-def _is_finite(state: TrainingState) -> bool:
+def is_finite(state: TrainingState) -> bool:
     """Whether the networks and the normaliser may be saved."""
     leaves = jax.device_get(jax.tree.leaves((state.params, state.normalizer)))
     return all(np.isfinite(leaf).all() for leaf in leaves)

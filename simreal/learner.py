@@ -421,4 +421,6 @@ def _latest(last_success: jax.Array, ended: Ended, learning: int) -> jax.Array:
         done, success = step
         return jnp.where(done, success, last), None
 
-    return jax.lax.scan(later, last_success, (ended.done[:, learning:], ended.success[:, learning:]))[0]
+    # One whose physics blew up did not succeed: a policy that breaks the simulator shall not look good.
+    over = ended.done | ended.quarantined
+    return jax.lax.scan(later, last_success, (over[:, learning:], ended.success[:, learning:]))[0]

@@ -50,6 +50,11 @@ class Population:
         hypers = [Hyper.of(config.learner) for config in configs]
         self.hyper: Hyper = jax.tree.map(lambda *numbers: np.asarray(numbers, np.float32), *hypers)
         each = ranges or [env.randomizer.ranges] * len(configs)
+        if len({jax.tree.structure(one) for one in each}) > 1:
+            raise UserError(
+                "members of a population may not differ in the kind of a distribution, only in its numbers: "
+                "give `randomizer` the same factors in all"
+            )
         self.ranges = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
     @property
@@ -117,12 +122,13 @@ def check_members(configs: Sequence[RunConfig]) -> None:
         raise UserError("a population needs at least one member")
     first = _flat(configs[0].to_dict())
     for config in configs[1:]:
-        for place, value in _flat(config.to_dict()).items():
-            same_kind = (value is None) == (first.get(place) is None)
-            may = any(place == name or place.startswith(f"{name}.") for name in MAY_DIFFER)
-            if value != first.get(place) and not (may and same_kind):
+        other = _flat(config.to_dict())
+        for place in first | other:
+            one, two = first.get(place), other.get(place)
+            may = place in MAY_DIFFER and (one is None) == (two is None)
+            if one != two and not may:
                 raise UserError(
-                    f"members of a population may not differ in {place} ({first.get(place)} and {value}); "
+                    f"members of a population may not differ in {place} ({one} and {two}); "
                     f"they may in {', '.join(MAY_DIFFER)}"
                 )
 
@@ -139,5 +145,6 @@ def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for key, value in values.items():
         place = f"{prefix}{key}"
-        flat |= _flat(value, f"{place}.") if isinstance(value, dict) and value else {place: value}
+        nested = isinstance(value, dict) and place not in MAY_DIFFER
+        flat |= _flat(value, f"{place}.") if nested else {place: value}
     return flat

@@ -129,8 +129,9 @@ class Recorder:
     def watch(self, steps: int, before: RolloutState, flight: Flight) -> None:
         """Called after each unroll. The one before is read now, so that nobody waits for this one."""
         self.flush()
-        self._past.append((steps, before, flight))
-        self._unread = True
+        if self.written < self.most:
+            self._past.append((steps, before, flight))
+            self._unread = True
 
     def flush(self) -> None:
         """Reads the newest unroll."""
@@ -143,8 +144,9 @@ class Recorder:
             if self.written < self.most:
                 recording = self._record(int(step), int(world))
                 name = f"{recording.meta['training_step']:010d}-{step:03d}-{world:05d}.npz"
-                recording.save(self.folder / name)
-                self.written += 1
+                if not (self.folder / name).exists():  # a resumed run comes by again, with a shorter past
+                    recording.save(self.folder / name)
+                    self.written += 1
 
     def _record(self, last: int, world: int) -> Recording:
         """What led to the blow-up of a world in step `last` of the newest unroll.

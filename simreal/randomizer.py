@@ -249,8 +249,13 @@ class WorldBuilder:
 
     # -- worlds --------------------------------------------------------------------------------------------
 
-    def build(self, draws: Mapping[str, Any]) -> World:
-        """The World of these draws; unnamed factors are nominal. Pure: jit and vmap it."""
+    def build(self, draws: Mapping[str, Any], ranges: Ranges | None = None) -> World:
+        """The World of these draws; unnamed factors are nominal. Pure: jit and vmap it.
+
+        Args:
+            draws: factor -> value.
+            ranges: what `World.normalized` is relative to; default: the randomizer's.
+        """
         full = self.complete(draws)
         times = jnp.stack([full[f"{n}_time"] for n in self.events]) if self.events else jnp.zeros(0)
         order = jnp.argsort(jnp.argsort(times))
@@ -268,7 +273,7 @@ class WorldBuilder:
             packed=packed,
             **parameters,
             draws=full,
-            normalized=self.normalize(full),
+            normalized=self.normalize(full, ranges),
             number=number,
             event_times=jnp.sort(times),
             variant=jnp.zeros((), jnp.int32),

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 Say = Callable[[str], None]
 
-MAY_CHANGE = ("engine", "steps", "target_success", "checkpoint", "evaluation")
+MAY_CHANGE = ("engine", "steps", "target_success", "checkpoint", "evaluation", "rollout.quarantine_files")
 """Settings that a resumed run may have otherwise: they do not change what an epoch computes. The engine is
 compared as the manifest has it, where `auto` is resolved."""
 
@@ -39,7 +39,7 @@ def check_config(before: RunConfig, now: RunConfig, folder: Path) -> None:
     old, new = _flat(before.to_dict()), _flat(now.to_dict())
     for place, value in new.items():
         then = old.get(place)
-        if then != value and place.partition(".")[0] not in MAY_CHANGE:
+        if then != value and place not in MAY_CHANGE and place.partition(".")[0] not in MAY_CHANGE:
             raise UserError(
                 f"--resume: {place} is {value} here and {then} in {folder}/config.yaml; "
                 f"pass that file as CONFIG, or start a run with --from {folder}"

@@ -112,7 +112,9 @@ class Rollout:
         self.reserve = BATCH * math.ceil((reserve or worlds) / BATCH)
         self.stagger = stagger
         builder = env.randomizer
-        self.draw_world = draw_world or (lambda key, ranges: builder.build(builder.sample(key, ranges)))
+        self.draw_world = draw_world or (
+            lambda key, ranges: builder.build(builder.sample(key, ranges), ranges)
+        )
 
     def start(self, key: jax.Array) -> RolloutState:
         """B worlds that wait for their first reset, which `refill` and `renew` give them."""

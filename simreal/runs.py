@@ -82,10 +82,7 @@ class Run:
         Raises:
             UserError: the folder holds something already, or cannot be made.
         """
-        if folder.is_dir() and any(folder.iterdir()):
-            raise UserError(
-                f"'{folder}' is not empty: --resume goes on with the run in it, --out starts one elsewhere"
-            )
+        cls.check_free(folder)
         run = cls(folder)
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -93,6 +90,14 @@ class Run:
         except OSError as error:
             raise UserError(f"cannot write to '{folder}': {error.strerror}") from error
         return run
+
+    @staticmethod
+    def check_free(folder: Path) -> None:
+        """Raises UserError where a new run would overwrite something."""
+        if folder.is_dir() and any(folder.iterdir()):
+            raise UserError(
+                f"'{folder}' is not empty: --resume goes on with the run in it, --out starts one elsewhere"
+            )
 
     @classmethod
     def open(cls, folder: Path) -> Run:

@@ -17,7 +17,7 @@ import numpy as np
 from simreal import quiet, registry
 from simreal.config import RunConfig
 from simreal.errors import UserError
-from simreal.keeping import Keeper, holds_target
+from simreal.keeping import Keeper, holds_target, is_finite
 from simreal.progress import Progress
 from simreal.resuming import check_config
 from simreal.runs import Run
@@ -108,6 +108,9 @@ def train_population(
     earlier = [_open(*pair) for pair in zip(configs, folders, strict=True)] if resume else None
     environments = [make_environment(config) for config in configs]
     population = Population(environments[0], configs, [env.randomizer.ranges for env in environments])
+    if earlier is None:
+        for folder in folders:
+            Run.check_free(folder)
     members = earlier or [Run.create(*pair) for pair in zip(folders, configs, strict=True)]
     with StopRequest() as stop, Progress(configs[0].steps) as progress:
         together = _Together(population)
@@ -121,7 +124,7 @@ def train_population(
             for keeper, own in zip(keepers, alone, strict=True):
                 keeper.start(own, None)
         else:
-            common = _newest_of_all(keepers)
+            common = _newest_of_all(keepers, out)
             alone = [keeper.resume(own, common) for keeper, own in zip(keepers, alone, strict=True)]
             state = jax.tree.map(lambda *leaves: jnp.stack(leaves), *alone)
         _run(together, state, keepers, out, stop, progress)
@@ -191,6 +194,8 @@ def _run(
     progress.say(f"training {trainer.name} on {trainer.engine} into {out}; compiling first")
 
     def save() -> None:
+        for keeper in keepers:  # all of the last time are on disk before the first of this time is begun
+            keeper.note_saved(wait=True)
         for i, keeper in enumerate(keepers):
             keeper.save(trainer.member(state, i))
 
@@ -201,16 +206,19 @@ def _run(
             start, before = time.monotonic(), step
             state, values = trainer.epoch(state, keepers)
             now = time.monotonic()
-            times = (before, now - start, now - began)
+            took, wall = now - start, now - began
+            alone = [trainer.member(state, i) for i in range(len(keepers))]
+            _check_finite(keepers, alone, before)
             rows = [
-                keeper.record(trainer.member(state, i), values[i], *times) for i, keeper in enumerate(keepers)
+                keeper.record(alone[i], values[i], before, took, wall) for i, keeper in enumerate(keepers)
             ]
             step = rows[0]["step"]
             progress.show(_overview(rows), last=step >= config.steps)
-            if stop.asked or time.monotonic() - saved_at >= config.checkpoint.every_seconds:
+            stopping = stop.asked  # read once: a signal may come at any time
+            if stopping or time.monotonic() - saved_at >= config.checkpoint.every_seconds:
                 save()
                 saved_at = time.monotonic()
-            if stop.asked:
+            if stopping:
                 for keeper in keepers:
                     keeper.note_saved(wait=True)
                 raise Interrupted(
@@ -221,20 +229,18 @@ def _run(
     done = f"{step:,} steps done"
     if step < config.steps:
         done = f"success held {config.target_success:.0%} at step {step:,}"
-    holds = "holds the policy" if len(keepers) == 1 else f"holds {len(keepers)} runs"
+    holds = "holds the policy" if isinstance(trainer, _Alone) else f"holds {len(keepers)} run folders"
     progress.say(f"{done}; {out} {holds}")
 
 
 @contextlib.contextmanager
 def _closing(keepers: Sequence[Keeper], step: int) -> Iterator[None]:
     """Opens what the keepers write to, and closes it in the end."""
-    for keeper in keepers:
-        keeper.open_events(step)
-    try:
-        yield
-    finally:
+    with contextlib.ExitStack() as stack:
         for keeper in keepers:
-            keeper.close()
+            keeper.open_events(step)
+            stack.callback(keeper.close)
+        yield
 
 
 @contextlib.contextmanager
@@ -263,7 +269,35 @@ def _open(config: RunConfig, folder: Path) -> Run:
     return run
 
 
-def _newest_of_all(keepers: Sequence[Keeper]) -> int:
-    """The newest step at which every member has a checkpoint; 0 where there is none."""
-    common = set.intersection(*(set(keeper.checkpoints.steps()) for keeper in keepers))
-    return max(common, default=0)
+def _newest_of_all(keepers: Sequence[Keeper], out: Path) -> int | None:
+    """The newest step at which every member has a sound checkpoint; None where no member has any.
+
+    Raises:
+        UserError: some have checkpoints, but there is no step at which all do.
+    """
+    sound = [keeper.checkpoints.sound_steps() for keeper in keepers]
+    common = set.intersection(*(set(steps) for steps in sound))
+    if not common and any(sound):
+        raise UserError(
+            f"--resume: there is no step at which all {len(keepers)} members in {out} have a checkpoint; "
+            f"each can be resumed alone, with --resume --out {keepers[0].run.folder} and so on"
+        )
+    return max(common, default=None)
+
+
+def _check_finite(keepers: Sequence[Keeper], states: Sequence[TrainingState], before: int) -> None:
+    """Raises UserError where a member's parameters are no longer finite; the others are saved first."""
+    fine = [is_finite(state) for state in states]
+    if all(fine):
+        return
+    for keeper, state, good in zip(keepers, states, fine, strict=True):
+        keeper.note_saved(wait=True)
+        if good:
+            keeper.save(state)
+            keeper.note_saved(wait=True)
+    broken = keepers[fine.index(False)]
+    alone = "" if len(keepers) == 1 else "; the other members are saved, and can be resumed each alone"
+    raise UserError(
+        f"{broken.run.folder}: parameters are no longer finite after step {before:,}; {broken.kept()}; "
+        f"a lower learner.learning_rate or learner.max_gradient_norm may help{alone}"
+    )
