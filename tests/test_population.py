@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -16,7 +18,7 @@ from simreal.learner import Learner
 from simreal.policy import load_policy
 from simreal.population import Population, check_members
 from simreal.runs import Run
-from simreal.training import make_environment, train_population
+from simreal.training import _newest_of_all, make_environment, train_population
 
 SEEDS = (3, 4, 7)
 SMALL = {
@@ -73,11 +75,11 @@ def test_members_differ(learnt):
 def test_the_others_numbers_do_not_change_a_bit_of_a_member(population, learnt):
     before = population.hyper
     try:
-        changed = {"learning_rate": [1e-3, 5e-3, 1e-4], "entropy_cost": [0.003, 0.1, 0.0]}
-        changed |= {"discount": [0.98, 0.5, 0.9], "clip": [0.2, 0.05, 0.5]}
-        population.hyper = dataclasses.replace(
-            before, **{name: np.asarray(values, np.float32) for name, values in changed.items()}
-        )
+        others = {"learning_rate": 5e-3, "entropy_cost": 0.1, "discount": 0.5, "clip": 0.05}
+        changed = {name: getattr(before, name).copy() for name in others}
+        for name, value in others.items():
+            changed[name][1:] = value
+        population.hyper = dataclasses.replace(before, **changed)
         state, _ = population.epoch(population.init())
     finally:
         population.hyper = before
@@ -92,8 +94,34 @@ def test_what_is_compiled_in_may_not_differ():
     check_members([config(0), config(1, **{"learner.learning_rate": 3e-4})])
     with pytest.raises(UserError, match="may not differ in worlds"):
         check_members([config(0), config(1, worlds=32)])
+    check_members([config(0, randomizer={"cart_mass": [0.5, 2.0]}), config(1)])
     with pytest.raises(UserError, match=r"may not differ in learner\.adaptive_kl"):
         check_members([config(0), config(0, **{"learner.adaptive_kl": 0.01})])
+
+
+def test_a_member_that_is_ahead_or_damaged_takes_nothing_from_the_others(tmp_path):
+    keepers = []
+    for name, steps in (("a", (1, 2, 3)), ("b", (2, 3, 4))):
+        checkpoints = Checkpoints(tmp_path / name)
+        for step in steps:
+            checkpoints.save(step, {"x": np.arange(3) + step})
+        keepers.append(SimpleNamespace(checkpoints=checkpoints, run=Run(tmp_path / name)))
+    assert _newest_of_all(keepers, tmp_path) == 3
+    (tmp_path / "b" / "3" / "sha256.json").unlink()
+    assert _newest_of_all(keepers, tmp_path) == 2
+    shutil.rmtree(tmp_path / "b" / "2")
+    with pytest.raises(UserError, match="no step at which all 2 members"):
+        _newest_of_all(keepers, tmp_path)
+    assert keepers[1].checkpoints.steps() == [3, 4]
+
+
+def test_the_critic_of_a_member_sees_draws_by_its_own_ranges(population):
+    builder = population.env.randomizer
+    wide = make_environment(config(0, randomizer={"cart_mass": [0.5, 2.0]})).randomizer.ranges
+    at = list(builder.draw_distributions).index("cart_mass")
+    draws = builder.nominal_draws() | {"cart_mass": 1.2}
+    assert float(builder.build(draws).normalized[at]) == pytest.approx(1.0)
+    assert float(builder.build(draws, wide).normalized[at]) == pytest.approx(-1 + 2 * 0.7 / 1.5)
 
 
 @pytest.mark.slow
