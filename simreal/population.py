@@ -134,8 +134,8 @@ def check_members(configs: Sequence[RunConfig]) -> None:
 
 
 def _each(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` of every member: side by side on an accelerator, one after the other on a CPU, where the
-    matrix products of one member fill the caches better than those of all."""
+    """`function` of every member: side by side on an accelerator; one after the other on a CPU, so that the
+    matrix products are those of a single run."""
     if jax.default_backend() != "cpu":
         return jax.vmap(function)
     return lambda *members: jax.lax.map(lambda one: function(*one), members)
