@@ -119,8 +119,9 @@ def describe(env: Environment, recording: Recording, again: Replay) -> list[str]
     if again.blew_up is None:
         lines.append(f"on {env.engine_name} all {n} actions went well")
     else:
-        same = ", every state bit for bit as recorded" if again.exact else ""
-        when = "as recorded" if again.blew_up == n - 1 else f"{(n - 1 - again.blew_up) * dt:.2f} s earlier"
+        same = "; every state is bit for bit the recorded one" if again.exact else ""
+        earlier = (n - 1 - again.blew_up) * dt
+        when = f"{earlier:.2f} s earlier" if earlier else "at the same step"
         lines.append(f"on {env.engine_name} it blew up again, {when}{same}")
     lines.append("     time      largest speed    (rad/s or m/s, before the last step)")
     last = len(again.qvel) - 1
