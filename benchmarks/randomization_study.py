@@ -20,7 +20,7 @@ from simreal.evaluation.statistics import paired_seed_interval, seed_interval
 from simreal.registry import environment_class
 from simreal.runs import Run
 
-SEEDS = {"cartpole_swingup": 5, "arm_reach": 5, "go2_walk": 5}
+SEEDS = {"cartpole_swingup": 5, "arm_reach": 5, "go2_walk": 3}
 WAYS = ("train", "nominal")
 FOLDER = Path("runs/study")
 
