@@ -19,8 +19,9 @@ def main() -> None:
     def run(state: simreal.State, key: jax.Array) -> tuple[simreal.State, jax.Array]:
         def step(state: simreal.State, key: jax.Array) -> tuple[simreal.State, jax.Array]:
             action = jax.random.uniform(key, (WORLDS, env.action_size), minval=-1, maxval=1)
+            over = state.done > 0  # nothing ends a loop of yours: count no reward after the end of an episode
             state = jax.vmap(env.step)(state, action)
-            return state, state.reward
+            return state.replace(done=jnp.maximum(state.done, over)), jnp.where(over, 0, state.reward)
 
         return jax.lax.scan(step, state, jax.random.split(key, STEPS))
 

@@ -74,7 +74,8 @@ def test_example_of_a_rollout_runs(capsys):
     low, high = map(float, re.findall(r"x (\d+\.\d+)", printed))
     assert 0.7 <= low < 0.75
     assert 1.35 < high <= 1.4
-    assert 0 < float(re.search(r"mean return .*: (\S+)", printed).group(1)) < 100
+    # Some of the worlds lose 20 at the end of the rail, once each.
+    assert -20 < float(re.search(r"mean return .*: (\S+)", printed).group(1)) < 100
     gradient = float(re.search(r"d return / d force .*: (\S+)", printed).group(1))
     assert math.isfinite(gradient)
     assert gradient != 0
