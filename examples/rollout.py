@@ -16,16 +16,17 @@ def main() -> None:
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), WORLDS))
 
     @jax.jit
-    def run(state: simreal.State, key: jax.Array) -> tuple[simreal.State, jax.Array]:
-        def step(state: simreal.State, key: jax.Array) -> tuple[simreal.State, jax.Array]:
+    def run(state: simreal.State, key: jax.Array) -> tuple[simreal.State, tuple[jax.Array, jax.Array]]:
+        def step(state: simreal.State, key: jax.Array) -> tuple[simreal.State, tuple[jax.Array, jax.Array]]:
             action = jax.random.uniform(key, (WORLDS, env.action_size), minval=-1, maxval=1)
-            over = state.done > 0  # nothing ends a loop of yours: count no reward after the end of an episode
             state = jax.vmap(env.step)(state, action)
-            return state.replace(done=jnp.maximum(state.done, over)), jnp.where(over, 0, state.reward)
+            return state, (state.reward, state.done)
 
         return jax.lax.scan(step, state, jax.random.split(key, STEPS))
 
-    state, rewards = run(state, jax.random.PRNGKey(1))
+    state, (rewards, done) = run(state, jax.random.PRNGKey(1))
+    # `step` goes on after the end of an episode: only what came up to the end counts.
+    rewards = jnp.where(jnp.cumsum(done, axis=0) - done == 0, rewards, 0)
     mass = state.world.draws["pole_mass"]
     print(f"{WORLDS} worlds, pole masses x {mass.min():.2f} to x {mass.max():.2f}")
     print(f"mean return of random actions over {STEPS} steps: {rewards.sum(axis=0).mean():.3f}")
