@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from simreal.progress import number, percent
 from simreal.runs import write_text
 
 EVERY = 10.0
@@ -75,7 +76,7 @@ def page(title: str, rows: Sequence[Mapping[str, Any]], total: int, done: bool) 
     reload = "" if done else f'<meta http-equiv="refresh" content="{EVERY:g}">'
     facts = (
         f"{state}: {step:,} of {total:,} steps in {_minutes(seconds)}{left}; "
-        f"return {_number(last['episode_return'])}, success {_percent(last['success_rate'])}"
+        f"return {number(last['episode_return'])}, success {percent(last['success_rate'])}"
     )
     if quarantined := sum(row.get("quarantined") or 0 for row in rows):
         facts += f"; {quarantined:.0f} worlds in quarantine"
@@ -108,16 +109,8 @@ def _figure(
         return f"{across:.1f},{up:.1f}"
 
     line = " ".join(place(x, y) for x, y in known)
-    marks = f'<text x="2" y="10">{_number(high)}</text><text x="2" y="{HEIGHT - 2}">{_number(low)}</text>'
+    marks = f'<text x="2" y="10">{number(high)}</text><text x="2" y="{HEIGHT - 2}">{number(low)}</text>'
     return f'{head}<polyline points="{line}"/>{marks}</svg></figure>'
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None or not math.isfinite(value) else f"{value:.4g}"
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None or not math.isfinite(value) else f"{100 * value:.0f} %"
 
 
 def _minutes(seconds: float) -> str:

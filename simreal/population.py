@@ -22,6 +22,7 @@ from simreal.environment import Environment
 from simreal.errors import UserError
 from simreal.learner import Hyper, Learner, Programs, TrainingState, Watch, iterate, summarise
 from simreal.policy import Policy
+from simreal.resuming import flat
 from simreal.rollout import RolloutState
 
 MAY_DIFFER = ("seed", "randomizer", *(f"learner.{f.name}" for f in dataclasses.fields(Hyper)))
@@ -120,9 +121,9 @@ def check_members(configs: Sequence[RunConfig]) -> None:
     """Raises UserError where configurations cannot be members of one population."""
     if not configs:
         raise UserError("a population needs at least one member")
-    first = _flat(configs[0].to_dict())
+    first = flat(configs[0].to_dict(), MAY_DIFFER)
     for config in configs[1:]:
-        other = _flat(config.to_dict())
+        other = flat(config.to_dict(), MAY_DIFFER)
         for place in first | other:
             one, two = first.get(place), other.get(place)
             may = place in MAY_DIFFER and (one is None) == (two is None)
@@ -139,12 +140,3 @@ def _each(function: Callable[..., Any]) -> Callable[..., Any]:
     if jax.default_backend() != "cpu":
         return jax.vmap(function)
     return lambda *members: jax.lax.map(lambda one: function(*one), members)
-
-
-def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        place = f"{prefix}{key}"
-        nested = isinstance(value, dict) and place not in MAY_DIFFER
-        flat |= _flat(value, f"{place}.") if nested else {place: value}
-    return flat

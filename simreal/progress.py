@@ -63,7 +63,7 @@ class Progress:
     def _line(self, row: Mapping[str, Any]) -> str:
         line = (
             f"{_count(row['step'])} of {_count(self.total)} steps   "
-            f"return {_number(row['episode_return'])}   success {_percent(row['success_rate'])}"
+            f"return {number(row['episode_return'])}   success {percent(row['success_rate'])}"
         )
         self._quarantined += row.get("quarantined") or 0
         if self._quarantined:
@@ -80,11 +80,13 @@ def _count(steps: int) -> str:
     return f"{steps / 1e6:.2f} M" if steps >= 1e5 else f"{steps:,}"
 
 
-def _number(value: float | None) -> str:
+def number(value: float | None) -> str:
+    """Four digits, or - where it is not known."""
     return "-" if value is None or math.isnan(value) else f"{value:.4g}"
 
 
-def _percent(value: float | None) -> str:
+def percent(value: float | None) -> str:
+    """A share in percent, or - where it is not known."""
     return "-" if value is None or math.isnan(value) else f"{100 * value:.0f} %"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +36,7 @@ def take_policy(state: TrainingState, source: Run, say: Say) -> tuple[int, Train
 
 def check_config(before: RunConfig, now: RunConfig, folder: Path) -> None:
     """Refuses to resume a run as another one."""
-    old, new = _flat(before.to_dict()), _flat(now.to_dict())
+    old, new = flat(before.to_dict()), flat(now.to_dict())
     for place, value in new.items():
         then = old.get(place)
         if then != value and place not in MAY_CHANGE and place.partition(".")[0] not in MAY_CHANGE:
@@ -46,13 +46,14 @@ def check_config(before: RunConfig, now: RunConfig, folder: Path) -> None:
             )
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
+def flat(values: Mapping[str, Any], whole: Collection[str] = (), prefix: str = "") -> dict[str, Any]:
+    """Nested settings by their path, `a.b`; what lies under a path in `whole` stays together."""
+    found: dict[str, Any] = {}
     for key, value in values.items():
-        flat |= (
-            _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) and value else {prefix + key: value}
-        )
-    return flat
+        place = f"{prefix}{key}"
+        nested = isinstance(value, Mapping) and value and place not in whole
+        found |= flat(value, whole, f"{place}.") if nested else {place: value}
+    return found
 
 
 def check_manifest(before: Mapping[str, Any], now: Mapping[str, Any], folder: Path, say: Say) -> None:
